@@ -59,7 +59,8 @@ def _build_precomputed(
 
     if dataset is None:
         raise ConfigError("frontend.name: precomputed needs a recording of features")
-    return PrecomputedFrontend(dataset.observations)
+    checked = dataset.recording.run_motion is not None
+    return PrecomputedFrontend(dataset.observations, checks_matches=checked)
 
 
 BUILDERS: dict[str, Callable[[StereoCamera, FrontendSettings, Dataset | None], Frontend]] = {

@@ -80,6 +80,9 @@ class KltFrontend:
     deterministic to the bit: it depends on the images, the priors and the settings only.
     """
 
+    # by the motion of the left image, as it matches
+    checks_matches = True
+
     def __init__(
         self,
         camera: StereoCamera,

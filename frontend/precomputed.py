@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,19 +17,29 @@ from vio.records import FrontendOutput, IntArray, Observations, StereoFrame, Tra
 class PrecomputedFrontend:
     """Return recorded observations in place of tracking."""
 
-    def __init__(self, source: Callable[[int], Observations | None]) -> None:
-        self._source = source  # frame index to observations, such as `Dataset.observations`
+    def __init__(
+        self, source: Callable[[int], Observations | None], *, checks_matches: bool = False
+    ) -> None:
+        """Take what returns the observations of a frame by its index, such as
+        `Dataset.observations`; `checks_matches`: a run of this package made them, and has checked
+        their right matches.
+        """
+        self._source = source
+        self.checks_matches = checks_matches
+        # frames by which the right pixels are late, as `vio.guard.repairing.repaired` has it
+        self.right_delay = 0
         self._previous: IntArray = np.zeros(0, dtype=np.int64)
         self._highest = -1
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
-        """Return the recorded observations of the frame, unchanged; images and prior are not used.
+        """Return the recorded observations of the frame, unchanged but for `right_delay`; images
+        and prior are not used.
 
         Raises:
             DataError: the recording has no observations of this frame.
         """
         start = time.perf_counter()
-        found = self._source(frame.index)
+        found = self._paired(frame.index)
         if found is None:
             raise DataError(
                 f"frame {frame.index} has no precomputed observations; use a front end that reads "
@@ -41,3 +52,31 @@ class PrecomputedFrontend:
         self._highest = max(self._highest, int(found.ids.max(initial=-1)))
         stages_ms = {"replay": 1e3 * (time.perf_counter() - start)}
         return FrontendOutput(found, tracked, int(found.has_right.sum()), detected, stages_ms)
+
+    def _paired(self, index: int) -> Observations | None:
+        """Return the observations of a frame, left and right pixels of one exposure."""
+        found = self._source(index)
+        if found is None or self.right_delay == 0:
+            return found
+        after = self._source(index + 1)
+        if after is None:
+            return replace(found, has_right=np.zeros(len(found), dtype=np.bool_))
+        if self.right_delay > 0:
+            return with_right_of(found, after)
+        early = with_right_of(after, found)
+        return replace(early, frame_index=found.frame_index, time_ns=found.time_ns)
+
+
+def with_right_of(seen: Observations, other: Observations) -> Observations:
+    """Return the features of a frame with the right pixels that another frame shows of them.
+
+    Those that it does not show have none.
+    """
+    _, rows, others = np.intersect1d(
+        seen.ids, other.ids, assume_unique=True, return_indices=True
+    )
+    z = seen.z.copy()
+    z[rows, 2:] = other.z[others, 2:]
+    has_right = np.zeros(len(seen), dtype=np.bool_)
+    has_right[rows] = other.has_right[others]
+    return replace(seen, z=z, has_right=has_right)

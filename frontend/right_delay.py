@@ -55,9 +55,11 @@ class PairingCounts:
 class RightDelay(Finder):
     """Estimates the right camera's delay from the matches of all frames."""
 
-    def __init__(self, camera: StereoCamera) -> None:
+    def __init__(self, camera: StereoCamera, *, keeps_images: bool = True) -> None:
+        """Begin; `keeps_images`: right images that are early are kept for their left ones."""
         super().__init__()
         self._camera = camera
+        self._keeps_images = keeps_images
         self._normal: FloatArray = np.zeros((_TERMS + 1, _TERMS + 1))
         self._moment: FloatArray = np.zeros(_TERMS + 1)
         self._square = self._count = 0.0  # sums of squared rows and of weights
@@ -171,7 +173,7 @@ class RightDelay(Finder):
         self._suspected = (0.0, 0)
 
     def _begin(self, index: int, rounded: float, delay: float, frame_s: float) -> None:
-        if rounded == (1.0 if self._early else -1.0):
+        if self._keeps_images and rounded == (1.0 if self._early else -1.0):
             self._early = not self._early
             self._last_right = None
             self._forget()

@@ -119,6 +119,11 @@ CODES: dict[str, Code] = {
         "points of known depth are not where the right image should show them",
         "check the mount of the right camera, and that the cameras expose together",
     ),
+    "right-matches-lost": Code(
+        "degraded",
+        "hardly any feature has a right match any more; the left pixels are used",
+        _CAMERA,
+    ),
     "right-camera-turned": Code(
         "degraded",
         "the right camera has turned in its mount; what that does to disparities is taken out",

@@ -127,6 +127,15 @@ class FollowsRight(Protocol):
         """Return the features of the last good pair, followed in the right image of a frame."""
 
 
+@runtime_checkable
+class ChecksMatches(Protocol):
+    """A front end that may check its right matches itself, so that `vio.guard` need not."""
+
+    @property
+    def checks_matches(self) -> bool:
+        """Whether those of the last frame are checked."""
+
+
 class Selector(Protocol):
     """Decides which observations enter the filter's update."""
 

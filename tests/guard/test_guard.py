@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
@@ -104,6 +105,22 @@ def test_exchanged_images_are_put_back_to_the_bit(name: str) -> None:
     for expected, found in zip(run(name), run(name, _exchanged), strict=True):
         np.testing.assert_array_equal(found.observations.ids, expected.observations.ids)
         np.testing.assert_array_equal(found.observations.z, expected.observations.z)
+
+
+@pytest.mark.parametrize("name", ["orb", "sift"])
+def test_a_right_camera_that_turns_is_reported_by_its_rows(name: str) -> None:
+    """It rolls by a degree; `klt` finds that by its own matches."""
+    turns = cv2.getRotationMatrix2D((CAMERA.cu, CAMERA.cv), 1.0, 1.0)
+    frontend = guarded(build_frontend(name, CAMERA, SETTINGS), CAMERA)
+    outputs = []
+    for frame in frames():
+        if frame.index >= 7:
+            assert frame.right is not None
+            turned = cv2.warpAffine(frame.right, turns, frame.right.shape[::-1])
+            frame = replace(frame, right=np.asarray(turned, dtype=np.uint8))
+        outputs.append(frontend.process(frame))
+    assert codes(outputs) == ["right-contradicts-left"]
+    assert [bool(o.observations.has_right.any()) for o in outputs] == [k < 7 for k in range(FRAMES)]
 
 
 @pytest.mark.parametrize("name", ["orb", "sift"])

@@ -202,40 +202,58 @@ def compare_outcomes(
         )
     pairs = [(before[key], after[key]) for key in common]
     systems = list(dict.fromkeys(old.system for old, _ in pairs))
-    changes: list[Change] = []
-    for metrics in ((_PRIMARY.name,), _JUDGED[1:], _NOT_JUDGED):
-        tested = [
-            (system, metric, effect_of([float(np.mean(v)) for v in cases.values()], metric))
-            for system in systems
-            for metric in METRICS
-            if metric.name in metrics
-            if (
-                cases := _cases(
-                    [p for p in pairs if p[0].system == system], metric, drawn_each_seed
-                )
-            )
-        ]
-        adjusted = holm([effect.p for _, _, effect in tested])
-        changes += [
-            Change(
-                system, metric.name, effect, p, _verdict(effect, p, margin, metric.larger_is_better)
-            )
-            for (system, metric, effect), p in zip(tested, adjusted, strict=True)
-        ]
+    changes = [
+        change
+        for names in ((_PRIMARY.name,), _JUDGED[1:], _NOT_JUDGED)
+        for change in _tested(pairs, systems, names, drawn_each_seed, margin)
+    ]
     return Comparison(
         tuple(sorted(changes, key=lambda c: systems.index(c.system))),
         tuple(_sequence_changes(pairs, systems, factor)),
-        tuple(
-            (o.sequence, o.system, n.failure or "")
-            for o, n in pairs
-            if o.failure is None and n.failure is not None
-        ),
-        tuple(
-            (o.sequence, o.system) for o, n in pairs if o.failure is not None and n.failure is None
-        ),
+        tuple((o.sequence, o.system, n.failure or "") for o, n in pairs if _fails_first(n, o)),
+        tuple((o.sequence, o.system) for o, n in pairs if _fails_first(o, n)),
         len(before) + len(after) - 2 * len(common),
         margin,
     )
+
+
+def _tested(
+    pairs: Sequence[_Pair],
+    systems: Iterable[str],
+    names: Collection[str],
+    drawn_each_seed: Collection[str],
+    margin: float,
+) -> Iterator[Change]:
+    """Yield the changes of a family of figures, tested together."""
+    metrics = [metric for metric in METRICS if metric.name in names]
+    tested = [
+        (system, metric, effect)
+        for system in systems
+        for metric, effect in _effects(pairs, system, metrics, drawn_each_seed)
+    ]
+    adjusted = holm([effect.p for _, _, effect in tested])
+    for (system, metric, effect), p in zip(tested, adjusted, strict=True):
+        verdict = _verdict(effect, p, margin, metric.larger_is_better)
+        yield Change(system, metric.name, effect, p, verdict)
+
+
+def _fails_first(run: Outcome, other: Outcome) -> bool:
+    """Whether a run failed, and the other did not."""
+    return run.failure is not None and other.failure is None
+
+
+def _effects(
+    pairs: Sequence[_Pair],
+    system: str,
+    metrics: Iterable[Metric],
+    drawn_each_seed: Collection[str],
+) -> Iterator[tuple[Metric, Effect]]:
+    """Yield the effects on a system's figures, of those that both sides have."""
+    own = [pair for pair in pairs if pair[0].system == system]
+    for metric in metrics:
+        cases = _cases(own, metric, drawn_each_seed)
+        if cases:
+            yield metric, effect_of([float(np.mean(v)) for v in cases.values()], metric)
 
 
 def _cases(

@@ -30,14 +30,23 @@ from vio.records import (
 )
 from vio.runs.pipeline import RunResult
 
-# A keyframe is at a place seen before where a keyframe of an earlier visit is so near and looks the
-# same way.
-_REVISIT_M = 3.0
-_REVISIT_DEG = 30.0
+
+@dataclass(frozen=True, slots=True)
+class _LoopRules:
+    """What counts as a revisit, a false loop, and a place."""
+
+    # A keyframe is at a place seen before where a keyframe of an earlier visit is so near and looks the
+    # same way.
+    revisit_m: float = 3.0
+    revisit_deg: float = 30.0
+    false_m: float = 0.5  # error of a loop's motion, or of a place, from which it is false
+    false_deg: float = 5.0
+    # stated standard deviation of a position beyond which a frame is not localised
+    placed_m: float = 1.0
+
+
+_LOOPS = _LoopRules()
 _REVISIT_NS = 10 * NS_PER_S
-_FALSE_M = 0.5  # error of a loop's motion, or of a place, from which it is false
-_FALSE_DEG = 5.0
-_PLACED_M = 1.0  # stated standard deviation of a position beyond which a frame is not localised
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +112,7 @@ def map_figures(
     figures: dict[str, Any] = {
         "map_ate_m": evaluate(final, reference, T_cam0_imu=result.T_cam0_body).ate_m.rmse
     }
-    known = np.trace(mapped.causal["covariance"][:, :3, :3], axis1=1, axis2=2) < _PLACED_M**2
+    known = np.trace(mapped.causal["covariance"][:, :3, :3], axis1=1, axis2=2) < _LOOPS.placed_m**2
     for first, end in covered:  # where the cameras show nothing, a pose is no place
         known &= (mapped.causal["index"] < first) | (mapped.causal["index"] >= end)
     placed = mapped.causal[known]
@@ -187,7 +196,8 @@ def wrong_share(T: FloatArray, T_true: FloatArray) -> float:
     E = se3_inverse(T_true) @ T
     return float(
         np.mean(
-            (np.linalg.norm(E[:, :3, 3], axis=1) > _FALSE_M) | (rotation_angle_deg(E) > _FALSE_DEG)
+            (np.linalg.norm(E[:, :3, 3], axis=1) > _LOOPS.false_m)
+            | (rotation_angle_deg(E) > _LOOPS.false_deg)
         )
     )
 
@@ -224,7 +234,7 @@ def loop_figures(
                     float(np.degrees(np.linalg.norm(so3_log(E[:3, :3])))),
                 )
             )
-    false = sum(metres > _FALSE_M or degrees > _FALSE_DEG for metres, degrees in errors)
+    false = sum(metres > _LOOPS.false_m or degrees > _LOOPS.false_deg for metres, degrees in errors)
     times_ns = np.array([row.time_ns for row in keyframes], dtype=np.int64)
     revisits = _revisits(true, times_ns)
     found = {loop.second for loop in loops}
@@ -243,8 +253,8 @@ def _revisits(T_world_cam: dict[int, FloatArray], times_ns: IntArray) -> set[int
     out = set[int]()
     for row, k in enumerate(numbers):
         before = T[:row][times_ns[numbers[:row]] <= times_ns[k] - _REVISIT_NS]
-        near = np.linalg.norm(before[:, :3, 3] - T[row, :3, 3], axis=1) <= _REVISIT_M
-        along = before[:, :3, 2] @ T[row, :3, 2] >= np.cos(np.radians(_REVISIT_DEG))
+        near = np.linalg.norm(before[:, :3, 3] - T[row, :3, 3], axis=1) <= _LOOPS.revisit_m
+        along = before[:, :3, 2] @ T[row, :3, 2] >= np.cos(np.radians(_LOOPS.revisit_deg))
         if (near & along).any():
             out.add(k)
     return out

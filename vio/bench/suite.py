@@ -133,15 +133,13 @@ def suite_from(values: Any, path: Path) -> Suite:
     where = str(path)
     given = _mapping(values, where, "a suite")
     _only_keys(given, [f.name for f in fields(Suite) if f.name != "folder"], where)
-    sequences = _mapping(given.get("sequences"), where, "'sequences'")
-    configurations = _mapping(
+    sequences = _named(given.get("sequences"), where, "'sequences'")
+    configurations = _named(
         given.get("configurations") or {"default": {}}, where, "'configurations'"
     )
-    for name in (*sequences, *configurations):
-        if not _NAME.fullmatch(str(name)):
-            raise ConfigError(f"{where}: '{name}' is no name; use letters, digits and . _ + -")
     if not sequences:
         raise ConfigError(f"{where}: no sequences; name at least one")
+    titles = _mapping(given.get("titles") or {}, where, "'titles'")
     limit = given.get("time_limit_s")
     suite = Suite(
         name=str(given.get("name", path.stem)),
@@ -155,24 +153,27 @@ def suite_from(values: Any, path: Path) -> Suite:
         published=tuple(
             _published(value, where, sequences) for value in given.get("published") or ()
         ),
-        titles={
-            str(k): str(v)
-            for k, v in _mapping(given.get("titles") or {}, where, "'titles'").items()
-        },
+        titles={str(name): str(title) for name, title in titles.items()},
         publisher=None if given.get("publisher") is None else str(given["publisher"]),
         success_percent=_positive(
             given.get("success_percent", SUCCESS_PERCENT), "success_percent", where
         ),
         time_limit_s=None if limit is None else _positive(limit, "time_limit_s", where),
     )
+    _check_combinations(suite, where)
+    return suite
+
+
+def _check_combinations(suite: Suite, where: str) -> None:
+    """Raise where a sequence needs the map of none, or a run's settings are wrong."""
+    known = [sequence.name for sequence in suite.sequences]
     for sequence in suite.sequences:
-        if sequence.map_of is not None and (sequence.map or sequence.map_of not in sequences):
+        if sequence.map_of is not None and (sequence.map or sequence.map_of not in known):
             names = f"map_of of {sequence.name} names another sequence of the suite"
             raise ConfigError(f"{where}: {names}, without map: true")
     for configuration in suite.configurations:
         for sequence in suite.sequences:
             config_of(suite, sequence, configuration, suite.seeds[0])
-    return suite
 
 
 def config_of(suite: Suite, sequence: Sequence, configuration: str, seed: int) -> Config:
@@ -228,6 +229,15 @@ def chosen(suite: Suite, only: Iterable[str], configurations: Iterable[str]) -> 
     )
 
 
+def _named(value: Any, where: str, what: str) -> Mapping[Any, Any]:
+    """Return a mapping whose keys are names."""
+    given = _mapping(value, where, what)
+    for name in given:
+        if not _NAME.fullmatch(str(name)):
+            raise ConfigError(f"{where}: '{name}' is no name; use letters, digits and . _ + -")
+    return given
+
+
 def _sequence(name: str, value: Any, where: str) -> Sequence:
     place = f"{where}, sequence {name}"
     given: dict[str, Any] = {"source": value}
@@ -237,24 +247,11 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
     if ("source" in given) == ("render" in given):
         raise ConfigError(f"{place}: give either source or render")
     if "render" in given:
-        words = given["render"]
-        given["render"] = tuple(shlex.split(words) if isinstance(words, str) else map(str, words))
-        if own := [word for word in given["render"] if _names_own_option(word)]:
-            raise ConfigError(f"{place}: {own[0]} is set by the bench; leave it out")
+        given["render"] = _render_words(given["render"], place)
     try:
-        for key in ("start", "stop"):
-            if given.get(key) is not None:
-                given[key] = str(given[key])
-                parse_bound(given[key])
-        given["covered"] = tuple(
-            (str(begin), str(end)) for begin, end in given.get("covered") or ()
-        )
-        for bound in (bound for span in given["covered"] for bound in span):
-            parse_bound(bound)
+        given |= _span(given)
         if given.get("lengths_m") is not None:
-            given["lengths_m"] = tuple(float(v) for v in given["lengths_m"])
-            if not given["lengths_m"] or any(not 0 < v < float("inf") for v in given["lengths_m"]):
-                raise ValueError(f"lengths_m {given['lengths_m']}")
+            given["lengths_m"] = _lengths_m(given["lengths_m"])
     except (ValueError, TypeError) as error:
         text = "start and stop are frames or times as 12s, covered pairs of them, lengths_m metres"
         raise ConfigError(f"{place}: {text} ({error})") from error
@@ -266,6 +263,42 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
             given[key] = str(given[key])
     _mapping(given.get("settings") or {}, where, f"settings of sequence {name}")
     return Sequence(name=name, **given)
+
+
+def _render_words(words: Any, place: str) -> tuple[str, ...]:
+    """Return the options of a render, none of which is the bench's own."""
+    options = tuple(shlex.split(words) if isinstance(words, str) else map(str, words))
+    own = [word for word in options if _names_own_option(word)]
+    if own:
+        raise ConfigError(f"{place}: {own[0]} is set by the bench; leave it out")
+    return options
+
+
+def _span(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the bounds of what is run of a sequence and of what its reference covers.
+
+    Raises:
+        ValueError, TypeError: one is no bound.
+    """
+    out: dict[str, Any] = {
+        key: str(given[key]) for key in ("start", "stop") if given.get(key) is not None
+    }
+    covered = tuple((str(begin), str(end)) for begin, end in given.get("covered") or ())
+    for bound in (*out.values(), *(bound for span in covered for bound in span)):
+        parse_bound(bound)
+    return {**out, "covered": covered}
+
+
+def _lengths_m(values: Any) -> tuple[float, ...]:
+    """Return the lengths of pieces.
+
+    Raises:
+        ValueError, TypeError: there is none, or one is no length.
+    """
+    lengths_m = tuple(float(v) for v in values)
+    if not lengths_m or any(not 0 < v < float("inf") for v in lengths_m):
+        raise ValueError(f"lengths_m {lengths_m}")
+    return lengths_m
 
 
 def _names_own_option(word: str) -> bool:

@@ -344,37 +344,38 @@ def matrix(
     by_sequence: dict[str, dict[str, Row]] = {}
     for row in rows:
         by_sequence.setdefault(row.sequence, {})[row.system] = row
-    for sequence, cells in by_sequence.items():
-        own = {s: cells[s] for s in columns if s in cells}
-        medians = {
-            s: r.cells[metric.name].median
-            for s, r in own.items()
-            if metric.name in r.cells and not r.failed
-        }
-        best = (
-            (max if metric.larger_is_better else min)(medians.values())
-            if len(medians) > 1
-            else None
-        )
+    for sequence, own in by_sequence.items():
+        best = _best_systems({s: own[s] for s in columns if s in own}, metric)
         texts = []
         for system in columns:
-            text = (
-                notes.because("there is no trajectory of this system") if system not in own else ""
-            )
-            if system in own:
-                text = (
-                    f"failed {own[system].failed} of {own[system].runs}"
-                    if own[system].failed
-                    else ""
-                )
-                text = text or row_text(
-                    own[system], metric, notes, for_documents=for_documents
-                ) + _part(own[system], metric)
-            texts.append(
-                f"**{text}**" if best is not None and medians.get(system) == best else text
-            )
+            text = _cell_text(own.get(system), metric, notes, for_documents=for_documents)
+            texts.append(f"**{text}**" if system in best else text)
         yield _line([named.get(sequence, sequence), *texts])
     yield from notes.lines()
+
+
+def _best_systems(own: Mapping[str, Row], metric: Metric) -> list[str]:
+    """Return the systems with the best figure of a sequence; none where only one has any."""
+    medians = {
+        s: r.cells[metric.name].median
+        for s, r in own.items()
+        if metric.name in r.cells and not r.failed
+    }
+    if len(medians) < 2:
+        return []
+    best = (max if metric.larger_is_better else min)(medians.values())
+    return [system for system, median in medians.items() if median == best]
+
+
+def _cell_text(
+    row: Row | None, metric: Metric, notes: Notes, *, for_documents: bool = False
+) -> str:
+    """Return a figure of a system and a sequence as it is in the table."""
+    if row is None:
+        return notes.because("there is no trajectory of this system")
+    if row.failed:
+        return f"failed {row.failed} of {row.runs}"
+    return row_text(row, metric, notes, for_documents=for_documents) + _part(row, metric)
 
 
 def _part(row: Row, metric: Metric) -> str:

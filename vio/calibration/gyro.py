@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vio.calibration.egomotion import CameraMotion
@@ -12,12 +14,22 @@ from vio.numerics.robust import jackknife, robust_sigma
 from vio.records import S_PER_NS, BoolArray
 
 _BLOCKS = 10  # of the jackknife
-_ROTATION_DEG = 1.0  # standard deviations beyond these are called weak …
+
+
+@dataclass(frozen=True, slots=True)
+class _FitRules:
+    """How the rotation to the gyro and the time offset are fitted."""
+
+    rotation_deg: float = 1.0  # standard deviation of the rotation beyond which it is called weak
+    largest_offset_s: float = 0.1
+    offset_step_s: float = 0.004
+    # rad/s per m/s: weight of a velocity's error relative to a rotation rate's
+    velocity_weight: float = 0.02
+
+
+_FIT = _FitRules()
 TIME_OFFSET_S = 0.005
 _MIN_RATE_RADPS = 0.02  # spread of the rotation rate below which the alignment is unobservable
-_LARGEST_OFFSET_S = 0.1
-_OFFSET_STEP_S = 0.004
-_VELOCITY_WEIGHT = 0.02  # rad/s per m/s: weight of a velocity's error relative to a rotation rate's
 
 
 def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservable:
@@ -45,7 +57,7 @@ def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservab
     errors = np.maximum(errors, problem.formal_sigma(solution, keep, sigma))
     rotation_sigma = np.degrees(errors[:3])
     weak = None
-    if rotation_sigma.max() > _ROTATION_DEG:
+    if rotation_sigma.max() > _FIT.rotation_deg:
         weak = "rotation about one axis (too little rotation about the others)"
     if errors[3] > TIME_OFFSET_S:
         weak = (
@@ -75,7 +87,7 @@ class _GyroProblem:
         self._end = (motion.times_ns[motion.frames + 1] - self._origin) * S_PER_NS
         self._dt = self._end - self._begin
         self._omega = motion.twists[:, 3:]
-        margin = _LARGEST_OFFSET_S
+        margin = _FIT.largest_offset_s
         inside = (self._begin >= self._t[0]) & (self._end <= self._t[-1])
         shiftable = (self._begin - margin >= self._t[0]) & (self._end + margin <= self._t[-1])
         self.covered: BoolArray = shiftable if shiftable.sum() > 0.5 * inside.sum() else inside
@@ -102,7 +114,9 @@ class _GyroProblem:
     def coarse_offset(self) -> float:
         """Return the offset at which the magnitudes of the two rotation rates agree best."""
         camera_rates = np.linalg.norm(self._omega, axis=1)[self.covered]
-        offsets = np.arange(-_LARGEST_OFFSET_S, _LARGEST_OFFSET_S + 1e-9, _OFFSET_STEP_S)
+        offsets = np.arange(
+            -_FIT.largest_offset_s, _FIT.largest_offset_s + 1e-9, _FIT.offset_step_s
+        )
         scores = []
         for offset in offsets:
             gyro_rates = np.linalg.norm(self.gyro(offset), axis=1)[self.covered]
@@ -131,7 +145,7 @@ class _GyroProblem:
         if self._velocities is None:
             return turning
         v_cam, v_imu = self._velocities
-        return np.concatenate([turning, (v_cam - v_imu @ R.T) * _VELOCITY_WEIGHT], axis=1)
+        return np.concatenate([turning, (v_cam - v_imu @ R.T) * _FIT.velocity_weight], axis=1)
 
     def fit(self, x: FloatArray, keep: BoolArray) -> FloatArray:
         """Fit by robust least squares from `x` on some of the intervals."""

@@ -11,15 +11,23 @@ import numpy as np
 from vio.calibration.findings import Fault, Finding, NotObservable
 from vio.geometry.stereo import StereoCamera
 
-# Standard deviations of what is left of a lens beyond its model, beside those of the estimate: on
-# four real drives with calibrations of their own, focal lengths came out by -0.4 to +3.3 % and
-# principal points by 1 to 4 % of a focal length from the given ones, with 0.3 to 0.7 % of standard
-# deviation.
-_LENS_FOCAL = 0.012
-_LENS_CENTRE = 0.02  # focal lengths
-_LARGEST_FOCAL = 0.03  # standard deviations above which nothing can be said
-_LARGEST_CENTRE = 0.05
-_NAMED_SIGMAS = 3.0
+
+@dataclass(frozen=True, slots=True)
+class _IntrinsicRules:
+    """When intrinsics are observable, and when they are called wrong."""
+
+    # Standard deviations of what is left of a lens beyond its model, beside those of the estimate: on
+    # four real drives with calibrations of their own, focal lengths came out by -0.4 to +3.3 % and
+    # principal points by 1 to 4 % of a focal length from the given ones, with 0.3 to 0.7 % of standard
+    # deviation.
+    lens_focal: float = 0.012
+    lens_centre: float = 0.02  # focal lengths
+    largest_focal: float = 0.03  # standard deviations above which nothing can be said
+    largest_centre: float = 0.05
+    named_sigmas: float = 3.0
+
+
+_RULES = _IntrinsicRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +61,9 @@ def judged_observable(
         centre_off: of the principal point, focal lengths.
         centre_sigma: its standard deviations.
     """
-    sigma = float(np.hypot(focal_sigma, _LENS_FOCAL))
-    across = [float(np.hypot(s, _LENS_CENTRE)) for s in centre_sigma]
-    if sigma > _LARGEST_FOCAL or max(across) > _LARGEST_CENTRE:
+    sigma = float(np.hypot(focal_sigma, _RULES.lens_focal))
+    across = [float(np.hypot(s, _RULES.lens_centre)) for s in centre_sigma]
+    if sigma > _RULES.largest_focal or max(across) > _RULES.largest_centre:
         return NotObservable(
             "focal length and principal point",
             f"the cameras turn too little: the standard deviations are {100 * sigma:.1f} % and "
@@ -72,7 +80,7 @@ def judge_intrinsics(found: Intrinsics | NotObservable) -> tuple[Finding, ...]:
     if isinstance(found, NotObservable):
         return ()
     out: dict[Fault, str] = {}
-    if abs(found.focal_off) > _NAMED_SIGMAS * found.focal_sigma:
+    if abs(found.focal_off) > _RULES.named_sigmas * found.focal_sigma:
         out["focal length wrong"] = (
             f"off by {100 * found.focal_off:+.1f} % (standard deviation "
             f"{100 * found.focal_sigma:.1f} %): "
@@ -81,7 +89,7 @@ def judge_intrinsics(found: Intrinsics | NotObservable) -> tuple[Finding, ...]:
             "again, and check that the images were not resized"
         )
     if any(
-        abs(o) > _NAMED_SIGMAS * s
+        abs(o) > _RULES.named_sigmas * s
         for o, s in zip(found.centre_off_px, found.centre_sigma_px, strict=True)
     ):
         (u, v) = found.centre_off_px

@@ -17,18 +17,35 @@ from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import jackknife, robust_sigma
 from vio.records import S_PER_NS, FeatureTracks, IntArray
 
-_BLOCKS = 10  # of the jackknife over windows
-_MAX_SIGMA_M = 0.02  # with a larger standard deviation the value is not observable
-_WINDOW_S = 1.0
-_MIN_WINDOWS = 12
 
-_MIN_INTERVALS = 40  # frame intervals needed to judge two lever arms
-_JUDGED_BLOCKS = 12  # of the jackknife over them
-_MIN_SIGMA = 0.1  # lower bound: a jackknife over few blocks is unreliable below this
-_LOG_ODDS = 10.0  # log-likelihood ratio that decides between two lever arms
-_HUBER = 2.0  # standard deviations
-_REWEIGHTINGS = 4
-_RIDGE = 1e-9  # keeps the fit solvable where a recording never accelerates or never rotates
+@dataclass(frozen=True, slots=True)
+class _FitRules:
+    """How a lever arm is fitted."""
+
+    blocks: int = 10  # of the jackknife over windows
+    max_sigma_m: float = 0.02  # with a larger standard deviation the value is not observable
+    window_s: float = 1.0
+    min_windows: int = 12
+    huber: float = 2.0  # standard deviations
+    reweightings: int = 4
+    # keeps the fit solvable where a recording never accelerates or never rotates
+    ridge: float = 1e-9
+
+
+_FIT = _FitRules()
+
+
+@dataclass(frozen=True, slots=True)
+class _JudgeRules:
+    """How two lever arms are compared."""
+
+    min_intervals: int = 40  # frame intervals needed to judge two lever arms
+    judged_blocks: int = 12  # of the jackknife over them
+    min_sigma: float = 0.1  # lower bound: a jackknife over few blocks is unreliable below this
+    log_odds: float = 10.0  # log-likelihood ratio that decides between two lever arms
+
+
+_JUDGE = _JudgeRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,19 +72,19 @@ def estimate_lever_arm(
     if alignment.weak is not None:
         return NotObservable(what, f"the motion leaves unobservable the {alignment.weak}")
     blocks = _windows(motion, rates, alignment)
-    if len(blocks) < _MIN_WINDOWS:
+    if len(blocks) < _FIT.min_windows:
         return NotObservable(
             what,
-            f"only {len(blocks)} windows of {_WINDOW_S:g} s are without tracking loss "
-            f"({_MIN_WINDOWS} needed)",
+            f"only {len(blocks)} windows of {_FIT.window_s:g} s are without tracking loss "
+            f"({_FIT.min_windows} needed)",
         )
     x = _solve_windows(blocks)
     refits = [
-        _solve_windows([b for k, b in enumerate(blocks) if k % _BLOCKS != left_out])
-        for left_out in range(_BLOCKS)
+        _solve_windows([b for k, b in enumerate(blocks) if k % _FIT.blocks != left_out])
+        for left_out in range(_FIT.blocks)
     ]
     sigma = jackknife(refits)[:3]
-    if sigma.max() > _MAX_SIGMA_M:
+    if sigma.max() > _FIT.max_sigma_m:
         axis = "xyz"[int(np.argmax(sigma))]
         return NotObservable(
             what,
@@ -92,9 +109,9 @@ def _windows(
     first = 0
     while first < len(t_frame) - 1:
         last = first
-        while last in steps and t_frame[last] - t_frame[first] < _WINDOW_S:
+        while last in steps and t_frame[last] - t_frame[first] < _FIT.window_s:
             last += 1
-        whole = t_frame[last] - t_frame[first] >= 0.8 * _WINDOW_S
+        whole = t_frame[last] - t_frame[first] >= 0.8 * _FIT.window_s
         inside = t_imu[0] <= t_frame[first] and t_imu[-1] >= t_frame[last]
         if not (whole and inside):
             first = max(last, first + 1)
@@ -231,7 +248,7 @@ def judge_lever_arms(
     turned = np.concatenate([middle[:, :3] @ R_cam0_imu.T, middle[:, 3:] @ R_cam0_imu.T], axis=1)
     seen = stereo_twists(camera, tracks, times_ns, turned)
     count = len(seen.frames)
-    if count < _MIN_INTERVALS:
+    if count < _JUDGE.min_intervals:
         return LeverArmVerdict(None, 0.0, float("inf"), count)
     v_cam = seen.twists[:, :3] @ R_cam0_imu
     omega = seen.twists[:, 3:] @ R_cam0_imu
@@ -244,10 +261,10 @@ def judge_lever_arms(
     signal = np.cross(omega, half)
     every = np.arange(count)
     place = _fit_place(y, signal, nuisance)
-    left_out = [np.setdiff1d(every, block) for block in np.array_split(every, _JUDGED_BLOCKS)]
+    left_out = [np.setdiff1d(every, block) for block in np.array_split(every, _JUDGE.judged_blocks)]
     refits = [_fit_place(y[keep], signal[keep], nuisance[keep]) for keep in left_out]
-    sigma = max(float(jackknife(refits)), _MIN_SIGMA)
-    better = int(place > 0) if 2 * abs(place) / sigma**2 > _LOG_ODDS else None
+    sigma = max(float(jackknife(refits)), _JUDGE.min_sigma)
+    better = int(place > 0) if 2 * abs(place) / sigma**2 > _JUDGE.log_odds else None
     return LeverArmVerdict(better, place, sigma, count)
 
 
@@ -263,13 +280,13 @@ def _fit_place(y: FloatArray, signal: FloatArray, nuisance: FloatArray) -> float
         sigma = 1.0
         x = np.zeros(X.shape[1])
         normal = np.eye(X.shape[1])
-        for _ in range(_REWEIGHTINGS):
+        for _ in range(_FIT.reweightings):
             weighted = X / scale * weight[:, None]
-            normal = weighted.T @ (X / scale) + _RIDGE * np.eye(X.shape[1])
+            normal = weighted.T @ (X / scale) + _FIT.ridge * np.eye(X.shape[1])
             x = np.linalg.solve(normal, weighted.T @ y[:, axis]) / scale
             r = y[:, axis] - X @ x
             sigma = max(robust_sigma(r), 1e-9)
-            weight = np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(r), 1e-12))
+            weight = np.minimum(1.0, _FIT.huber * sigma / np.maximum(np.abs(r), 1e-12))
         variance = float(np.linalg.inv(normal)[0, 0]) * (sigma / scale[0]) ** 2
         top += x[0] / variance
         bottom += 1 / variance

@@ -17,18 +17,37 @@ from vio.numerics.robust import robust_sigma
 from vio.records import BoolArray, IntArray
 
 _BLOCKS = 10  # of a jackknife
-_WIDEST_DEG = 1.0  # gates on epipolar angles in successive fits
-_NARROWER_DEG = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class _FitRules:
+    """How the rotation and direction of a pair are fitted."""
+
+    widest_deg: float = 1.0  # gates on epipolar angles in successive fits
+    narrower_deg: float = 0.3
+    min_pairs: int = 3
+    stereo_rotation_deg: float = 0.2  # with larger standard deviations the value is not observable
+    stereo_direction_deg: float = 2.0
+
+
+_FIT = _FitRules()
 _MIN_MATCHES = 150
-_MIN_PAIRS = 3
-_STEREO_ROTATION_DEG = 0.2  # with larger standard deviations the value is not observable
-_STEREO_DIRECTION_DEG = 2.0
-# What a lens model that is off by half a pixel in the corners does to the rotation from single
-# pairs: rows cannot tell a yaw from a tangential distortion of 1e-3, which calibrations leave.
-_LENS_DEG = 0.15
-_EDGE = 0.95  # quantile of the rays' angles off the axis at which a lens model is off by that
+
+
+@dataclass(frozen=True, slots=True)
+class _LensRules:
+    """When residuals show that a lens model is off."""
+
+    # What a lens model that is off by half a pixel in the corners does to the rotation from single
+    # pairs: rows cannot tell a yaw from a tangential distortion of 1e-3, which calibrations leave.
+    lens_deg: float = 0.15
+    # quantile of the rays' angles off the axis at which a lens model is off by that
+    edge: float = 0.95
+    min_in_cell: int = 15  # matches that make a cell's median
+
+
+_LENS = _LensRules()
 _CELLS = 5  # across the image, a side of the grid on which residuals show a distortion
-_MIN_IN_CELL = 15  # matches that make a cell's median
 
 # R_cam1_cam0 (3, 3), unit direction (3,) from cam0 to cam1 in cam0
 _Pose: TypeAlias = tuple[FloatArray, FloatArray]
@@ -102,9 +121,9 @@ def refine_stereo(
     R = R_cam1_cam0
     d = direction
     inliers = matches
-    for gate in (np.radians(_WIDEST_DEG), np.radians(_NARROWER_DEG), None):
+    for gate in (np.radians(_FIT.widest_deg), np.radians(_FIT.narrower_deg), None):
         angles = np.abs(epipolar_angles(R, d, matches))
-        near = angles < np.radians(_WIDEST_DEG)
+        near = angles < np.radians(_FIT.widest_deg)
         spread = robust_sigma(angles[near]) if near.any() else 1.0
         limit = gate if gate is not None else max(4 * spread, 1e-5)
         inliers = matches.take(angles < limit)
@@ -119,8 +138,8 @@ def refine_stereo(
     turns = np.array([so3_log(Rk @ R.T) for Rk, _ in refits])
     swings = np.array([np.cross(d, dk) for _, dk in refits])
     rotation_sigma, direction_sigma = (_jackknife_norm(v) for v in (turns, swings))
-    if rotation_sigma > np.radians(_STEREO_ROTATION_DEG) or direction_sigma > np.radians(
-        _STEREO_DIRECTION_DEG
+    if rotation_sigma > np.radians(_FIT.stereo_rotation_deg) or direction_sigma > np.radians(
+        _FIT.stereo_direction_deg
     ):
         return NotObservable(
             "left-right extrinsics",
@@ -131,7 +150,7 @@ def refine_stereo(
     return StereoEstimate(
         R_cam1_cam0=R,
         direction=d,
-        rotation_sigma_deg=float(np.hypot(np.degrees(rotation_sigma), _LENS_DEG)),
+        rotation_sigma_deg=float(np.hypot(np.degrees(rotation_sigma), _LENS.lens_deg)),
         direction_sigma_deg=float(
             np.degrees(np.hypot(direction_sigma, _lens_swing(inliers, R, d, max(spread, 1e-6))))
         ),
@@ -173,7 +192,9 @@ def _cells(angles: FloatArray) -> IntArray:
 def _structure(values: FloatArray, cells: IntArray) -> float:
     """Return the rms over the cells (N,) of the medians of values (N,)."""
     medians = [
-        np.median(values[cells == k]) for k, n in enumerate(np.bincount(cells)) if n >= _MIN_IN_CELL
+        np.median(values[cells == k])
+        for k, n in enumerate(np.bincount(cells))
+        if n >= _LENS.min_in_cell
     ]
     return float(np.sqrt(np.mean(np.square(medians)))) if medians else float("inf")
 
@@ -186,10 +207,10 @@ def _bends(rays: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     may be wide.
     """
     angles = _angles(rays)
-    edge = max(float(np.quantile(np.linalg.norm(angles, axis=1), _EDGE)), 1e-6)
+    edge = max(float(np.quantile(np.linalg.norm(angles, axis=1), _LENS.edge)), 1e-6)
     xy = angles / edge
     r2 = np.sum(xy**2, axis=1, keepdims=True)
-    size = np.radians(_LENS_DEG)
+    size = np.radians(_LENS.lens_deg)
     return size * xy * r2, *(
         size / 3 * (r2 * axis + 2 * xy * xy[:, k : k + 1]) for k, axis in enumerate(np.eye(2))
     )
@@ -214,12 +235,12 @@ def too_few(matches: RayMatches) -> NotObservable | None:
     None: there are enough.
     """
     pairs = len(np.unique(matches.pair))
-    if len(matches.pair) >= _MIN_MATCHES and pairs >= _MIN_PAIRS:
+    if len(matches.pair) >= _MIN_MATCHES and pairs >= _FIT.min_pairs:
         return None
     return NotObservable(
         "left-right extrinsics",
         f"only {len(matches.pair)} consistent matches in {pairs} pairs were found "
-        f"({_MIN_MATCHES} in {_MIN_PAIRS} "
+        f"({_MIN_MATCHES} in {_FIT.min_pairs} "
         "are needed); the images are too few, do not overlap, or have no texture",
     )
 
@@ -292,7 +313,7 @@ def row_residuals(z: FloatArray, width: float, height: float) -> RowResiduals | 
     for i in range(3):
         for j in range(3):
             here = (row == i) & (column == j)
-            if here.sum() >= _MIN_IN_CELL:
+            if here.sum() >= _LENS.min_in_cell:
                 grid[i, j] = smooth[here] = np.median(off[here])
     disparity = z[:, 0] - z[:, 2]
     return RowResiduals(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,19 +17,37 @@ from vio.geometry.lie import FloatArray, so3_log
 from vio.geometry.stereo import StereoCamera
 from vio.records import FeatureTracks, IntArray
 
-# spread of the given calibration's epipolar angles over that of the measured one
-_CLEARLY_WORSE = 2.0
-_EXCHANGED_DEG = 0.2  # largest epipolar angle of a calibration that fits
-_OPPOSITE_DEG = 20.0  # a direction so close to the negative of another is taken as inverted
-_NAMED_SIGMAS = 5.0  # a difference must exceed so many standard deviations …
-_NAMED_ROTATION_DEG = 0.3  # … and these limits, to be called a fault
-# where motion has separated a rotation from the lens model: half a pixel of disparity
-_NAMED_IN_MOTION_DEG = 0.05
-_NAMED_DIRECTION_DEG = 1.0
-_NAMED_IMU_ROTATION_DEG = 0.5
-_INVERSE_DEG = 5.0  # an inverse that fits so well is taken as the explanation
-_NAMED_LEVER_ARM_M = 0.03
-_NAMED_OFFSET_S = 0.002
+
+@dataclass(frozen=True, slots=True)
+class _Explanations:
+    """When a common mistake explains a difference."""
+
+    # spread of the given calibration's epipolar angles over that of the measured one
+    clearly_worse: float = 2.0
+    exchanged_deg: float = 0.2  # largest epipolar angle of a calibration that fits
+    # a direction so close to the negative of another is taken as inverted
+    opposite_deg: float = 20.0
+    inverse_deg: float = 5.0  # an inverse that fits so well is taken as the explanation
+
+
+_EXPLAINS = _Explanations()
+
+
+@dataclass(frozen=True, slots=True)
+class _NamedDifferences:
+    """Differences from a calibration above which they are called a fault."""
+
+    sigmas: float = 5.0  # a difference must exceed so many standard deviations …
+    rotation_deg: float = 0.3  # … and these limits, to be called a fault
+    # where motion has separated a rotation from the lens model: half a pixel of disparity
+    in_motion_deg: float = 0.05
+    direction_deg: float = 1.0
+    imu_rotation_deg: float = 0.5
+    lever_arm_m: float = 0.03
+    offset_s: float = 0.002
+
+
+_NAMED = _NamedDifferences()
 
 
 # --- left and right
@@ -51,7 +70,8 @@ def judge_stereo(
         return (swapped,)
     clear = estimate.segments is not None or (
         epipolar_spread(R_given, given, inliers)
-        > _CLEARLY_WORSE * epipolar_spread(estimate.R_cam1_cam0, estimate.direction, inliers)
+        > _EXPLAINS.clearly_worse
+        * epipolar_spread(estimate.R_cam1_cam0, estimate.direction, inliers)
     )
     found: dict[Fault, str] = {}
     swing_deg = _between_deg(estimate.direction, given)
@@ -106,17 +126,17 @@ def _judge_order(
 
 def _opposite(estimate: StereoEstimate, given: FloatArray) -> bool:
     return _between_deg(estimate.direction, given) > 180 - max(
-        _swing_limit_deg(estimate), _OPPOSITE_DEG
+        _swing_limit_deg(estimate), _EXPLAINS.opposite_deg
     )
 
 
 def _turn_limit_deg(estimate: StereoEstimate) -> float:
-    least = _NAMED_ROTATION_DEG if estimate.segments is None else _NAMED_IN_MOTION_DEG
-    return max(least, _NAMED_SIGMAS * estimate.rotation_sigma_deg)
+    least = _NAMED.rotation_deg if estimate.segments is None else _NAMED.in_motion_deg
+    return max(least, _NAMED.sigmas * estimate.rotation_sigma_deg)
 
 
 def _swing_limit_deg(estimate: StereoEstimate) -> float:
-    return max(_NAMED_DIRECTION_DEG, _NAMED_SIGMAS * estimate.direction_sigma_deg)
+    return max(_NAMED.direction_deg, _NAMED.sigmas * estimate.direction_sigma_deg)
 
 
 def judge_exchange(
@@ -137,7 +157,7 @@ def judge_exchange(
     as_given, other_way = (
         float(np.degrees(epipolar_spread(R, direction, m))) for m in (matches, exchanged)
     )
-    if other_way * _CLEARLY_WORSE > as_given or other_way > _EXCHANGED_DEG:
+    if other_way * _EXPLAINS.clearly_worse > as_given or other_way > _EXPLAINS.exchanged_deg:
         return ()
     return (
         Finding(
@@ -160,7 +180,7 @@ def judge_imu(
     found = [*_judge_rotation(alignment, T_cam0_imu[:3, :3])]
     if isinstance(lever_arm, LeverArm):
         found += _judge_translation(lever_arm, T_cam0_imu)
-    limit_s = max(_NAMED_OFFSET_S, _NAMED_SIGMAS * alignment.time_offset_sigma_s)
+    limit_s = max(_NAMED.offset_s, _NAMED.sigmas * alignment.time_offset_sigma_s)
     if alignment.time_offset_sigma_s < TIME_OFFSET_S and abs(alignment.time_offset_s) > limit_s:
         off_ms = 1e3 * alignment.time_offset_s
         sigma_ms = 1e3 * alignment.time_offset_sigma_s
@@ -178,11 +198,11 @@ def _judge_rotation(alignment: ImuAlignment, R: FloatArray) -> Iterator[Finding]
     off = so3_log(alignment.R_cam0_imu @ R.T)
     sigma = np.maximum(alignment.rotation_sigma_deg, 1e-3)
     if not (
-        np.abs(np.degrees(off)) > np.maximum(_NAMED_IMU_ROTATION_DEG, _NAMED_SIGMAS * sigma)
+        np.abs(np.degrees(off)) > np.maximum(_NAMED.imu_rotation_deg, _NAMED.sigmas * sigma)
     ).any():
         return
     inverse_deg = float(rotation_angle_deg(alignment.R_cam0_imu @ R))
-    if inverse_deg < max(_INVERSE_DEG, _NAMED_SIGMAS * float(sigma.max())):
+    if inverse_deg < max(_EXPLAINS.inverse_deg, _NAMED.sigmas * float(sigma.max())):
         yield Finding(
             "IMU-camera rotation inverted",
             f"the inverse of the given one fits to {inverse_deg:.2f} deg",
@@ -202,7 +222,7 @@ def _judge_translation(lever_arm: LeverArm, T_cam0_imu: FloatArray) -> Iterator[
     R = T_cam0_imu[:3, :3]
     t = T_cam0_imu[:3, 3]
     off_m = float(np.linalg.norm(lever_arm.t_cam0_imu - t))
-    if off_m <= max(_NAMED_LEVER_ARM_M, _NAMED_SIGMAS * float(np.linalg.norm(lever_arm.sigma_m))):
+    if off_m <= max(_NAMED.lever_arm_m, _NAMED.sigmas * float(np.linalg.norm(lever_arm.sigma_m))):
         return
     others = {
         "its negative": -t,

@@ -12,11 +12,19 @@ from vio.dense.surface import Mesh
 from vio.files.meshes import FREE, OCCUPIED, UNKNOWN
 from vio.geometry.lie import FloatArray
 
-_STEP_M = 0.2  # above the ground beside it, a surface is an obstacle …
-_CLEARANCE_M = 2.0  # … below this height; what is higher is passed under
-_GROUND_M = 1.5  # radius within which the lowest surface is the ground
-_MIN_VERTICES = 2  # of a cell's ground or obstacle
-_MAX_CELLS = 1 << 26
+
+@dataclass(frozen=True, slots=True)
+class _GroundRules:
+    """What is ground, and what an obstacle."""
+
+    step_m: float = 0.2  # above the ground beside it, a surface is an obstacle …
+    clearance_m: float = 2.0  # … below this height; what is higher is passed under
+    ground_m: float = 1.5  # radius within which the lowest surface is the ground
+    min_vertices: int = 2  # of a cell's ground or obstacle
+    max_cells: int = 1 << 26
+
+
+_GROUND = _GroundRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,20 +54,24 @@ def occupancy_grid(mesh: Mesh, R_upright_world: FloatArray, voxel_m: float) -> O
     low = np.floor(p[:, :2].min(axis=0) / cell_m).astype(np.int64)
     at = np.floor(p[:, :2] / cell_m).astype(np.int64) - low
     width, height = (at.max(axis=0) + 1).tolist()
-    if width * height > _MAX_CELLS:
+    if width * height > _GROUND.max_cells:
         return None
     cell = at[:, 1] * width + at[:, 0]
     lowest = np.full(width * height, np.inf)
     np.minimum.at(lowest, cell, p[:, 2])
     ground = minimum_filter(
-        lowest.reshape(height, width), size=2 * int(np.ceil(_GROUND_M / cell_m)) + 1, mode="nearest"
+        lowest.reshape(height, width),
+        size=2 * int(np.ceil(_GROUND.ground_m / cell_m)) + 1,
+        mode="nearest",
     )
     above = p[:, 2] - ground.ravel()[cell]
     standing = np.bincount(
-        cell[(above > _STEP_M) & (above < _CLEARANCE_M)], minlength=width * height
+        cell[(above > _GROUND.step_m) & (above < _GROUND.clearance_m)], minlength=width * height
     )
-    flat = np.bincount(cell[above <= _STEP_M], minlength=width * height).reshape(height, width)
-    occupied = standing.reshape(height, width) >= _MIN_VERTICES
-    free = binary_closing(flat >= _MIN_VERTICES, iterations=1) & ~occupied
+    flat = np.bincount(cell[above <= _GROUND.step_m], minlength=width * height).reshape(
+        height, width
+    )
+    occupied = standing.reshape(height, width) >= _GROUND.min_vertices
+    free = binary_closing(flat >= _GROUND.min_vertices, iterations=1) & ~occupied
     levels = np.where(occupied, OCCUPIED, np.where(free, FREE, UNKNOWN)).astype(np.uint8)
     return OccupancyGrid(levels, cell_m, low * cell_m)

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vio.dense.surface import Mesh
 from vio.geometry.lie import FloatArray
 from vio.records import Image
 
-_WIDTH = 1280
-_HEIGHT = 720
-_FOCAL = 1.1  # widths
-_PITCH_DEG = 40.0  # that the view looks down, and to the left of the path
-_ASIDE_DEG = 60.0
-_BACKGROUND = 245
-_AWAY = 0.1  # surfaces that face away by more than this are culled
-_SHARE_SEEN = 0.98  # of the vertices that are to be in the picture
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """The picture of a mesh, and where it is seen from."""
+
+    width: int = 1280
+    height: int = 720
+    focal: float = 1.1  # widths
+    pitch_deg: float = 40.0  # that the view looks down, and to the left of the path
+    aside_deg: float = 60.0
+    background: int = 245
+    away: float = 0.1  # surfaces that face away by more than this are culled
+    share_seen: float = 0.98  # of the vertices that are to be in the picture
+
+
+_VIEW = _View()
 
 
 def preview(mesh: Mesh, path_m: FloatArray, R_upright_world: FloatArray, voxel_m: float) -> Image:
@@ -30,7 +40,9 @@ def preview(mesh: Mesh, path_m: FloatArray, R_upright_world: FloatArray, voxel_m
     p, n = (x.astype(np.float64) @ R_upright_world.T for x in (mesh.vertices, mesh.normals))
     path = path_m @ R_upright_world.T
     axes = _view(path[-1, :2] - path[0, :2])
-    facing = n @ axes[2] < _AWAY  # so that neither a ceiling nor the nearest wall hides the rest
+    facing = (
+        n @ axes[2] < _VIEW.away
+    )  # so that neither a ceiling nor the nearest wall hides the rest
     line = _along(path, voxel_m)
     light = 0.65 + 0.35 * np.abs(n @ np.array([-0.3, -0.5, 0.81]))
     points = np.concatenate([p[facing], line])
@@ -43,8 +55,8 @@ def preview(mesh: Mesh, path_m: FloatArray, R_upright_world: FloatArray, voxel_m
 
 def _view(course: FloatArray) -> FloatArray:
     """Return right, down and ahead (3, 3) of a view down on a path that leads along (2,)."""
-    heading = np.arctan2(course[0], course[1]) - np.radians(_ASIDE_DEG)
-    pitch = np.radians(_PITCH_DEG)
+    heading = np.arctan2(course[0], course[1]) - np.radians(_VIEW.aside_deg)
+    pitch = np.radians(_VIEW.pitch_deg)
     right = np.array([np.cos(heading), -np.sin(heading), 0.0])
     ahead = np.array(
         [np.cos(pitch) * np.sin(heading), np.cos(pitch) * np.cos(heading), -np.sin(pitch)]
@@ -63,16 +75,20 @@ def _splat(q: FloatArray, colours: FloatArray, size_m: FloatArray, inside: int) 
     """Draw squares (N) at (N, 3) right, down and ahead, far ones first; the last `inside` are in
     the picture.
     """
-    image = np.full((_HEIGHT, _WIDTH, 3), _BACKGROUND, dtype=np.uint8)
+    image = np.full((_VIEW.height, _VIEW.width, 3), _VIEW.background, dtype=np.uint8)
     low, high = np.quantile(q, (0.02, 0.98), axis=0)
     q = q - (low + high) / 2
-    focal = _FOCAL * _WIDTH
+    focal = _VIEW.focal * _VIEW.width
     # As near as leaves most of the points in the picture.
     near = (
-        np.maximum(np.abs(q[:, 0]) * 2 * focal / _WIDTH, np.abs(q[:, 1]) * 2 * focal / _HEIGHT)
+        np.maximum(
+            np.abs(q[:, 0]) * 2 * focal / _VIEW.width, np.abs(q[:, 1]) * 2 * focal / _VIEW.height
+        )
         - q[:, 2]
     )
-    q[:, 2] += max(float(np.quantile(near, _SHARE_SEEN)), float(near[len(near) - inside :].max()))
+    q[:, 2] += max(
+        float(np.quantile(near, _VIEW.share_seen)), float(near[len(near) - inside :].max())
+    )
     order = np.argsort(-q[:, 2])
     q = q[order]
     colours = colours[order]
@@ -81,10 +97,10 @@ def _splat(q: FloatArray, colours: FloatArray, size_m: FloatArray, inside: int) 
     q = q[ahead_of]
     colours = colours[ahead_of]
     size_m = size_m[ahead_of]
-    u = np.rint(focal * q[:, 0] / q[:, 2] + _WIDTH / 2).astype(int)
-    v = np.rint(focal * q[:, 1] / q[:, 2] + _HEIGHT / 2).astype(int)
+    u = np.rint(focal * q[:, 0] / q[:, 2] + _VIEW.width / 2).astype(int)
+    v = np.rint(focal * q[:, 1] / q[:, 2] + _VIEW.height / 2).astype(int)
     reach = np.clip(np.ceil(0.5 * focal * size_m / q[:, 2]).astype(int), 0, 12)
-    shown = (u >= 0) & (v >= 0) & (u < _WIDTH) & (v < _HEIGHT)
+    shown = (u >= 0) & (v >= 0) & (u < _VIEW.width) & (v < _VIEW.height)
     for row in np.flatnonzero(shown).tolist():
         r = reach[row]
         image[max(v[row] - r, 0) : v[row] + r + 1, max(u[row] - r, 0) : u[row] + r + 1] = colours[

@@ -25,15 +25,24 @@ RotationSource: TypeAlias = Literal[
     "positions", "direction and orientations", "orientations", "first pose", "none"
 ]
 
-_COLLINEAR = 1e-13  # ratio of squared extents below which points are collinear, to rounding
-# positions determine the rotation about the path if its standard deviation is below 3 degrees
-_LOOSE_RAD = 0.05
-# ratio of standard deviations above which the orientations replace the positions in it
-_ORIENTATION_GAIN = 10.0
-# standard deviations by which they may differ; more: they do not describe the same body
-_CONTRADICTION = 5.0
-# extent, relative to the size of the coordinates, below which points coincide, to rounding
-_STATIONARY = 1e-12
+
+@dataclass(frozen=True, slots=True)
+class _AlignmentRules:
+    """When positions alone, or orientations too, decide an alignment."""
+
+    # ratio of squared extents below which points are collinear, to rounding
+    collinear: float = 1e-13
+    # positions determine the rotation about the path if its standard deviation is below 3 degrees
+    loose_rad: float = 0.05
+    # ratio of standard deviations above which the orientations replace the positions in it
+    orientation_gain: float = 10.0
+    # standard deviations by which they may differ; more: they do not describe the same body
+    contradiction: float = 5.0
+    # extent, relative to the size of the coordinates, below which points coincide, to rounding
+    stationary: float = 1e-12
+
+
+_RULES = _AlignmentRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +85,7 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
     sign = np.array([1.0, 1.0, 1.0 if np.linalg.det(U @ Vt) > 0 else -1.0])
     R = (U * sign) @ Vt
     rotation_from: RotationSource = "positions"
-    moving = min(x_extent, y_extent) > 0 and d[0] > _COLLINEAR * x_extent * y_extent
+    moving = min(x_extent, y_extent) > 0 and d[0] > _RULES.collinear * x_extent * y_extent
     if not moving:
         if mode == "sim3":
             raise EvaluationError(
@@ -84,7 +93,7 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
             )
         R = nearest_rotation(_orientation_sum(T_est, T_ref))
         rotation_from = "orientations"
-    elif d[1] <= _COLLINEAR * d[0]:
+    elif d[1] <= _RULES.collinear * d[0]:
         R = _rotate_about(U[:, 0], R, _orientation_sum(T_est, T_ref))
         rotation_from = "direction and orientations"
     scale = float(d @ sign) / x_extent**2 if mode == "sim3" else 1.0
@@ -106,8 +115,8 @@ def settle_rotation(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) 
     R = _rotate_about(axis, alignment.R, _orientation_sum(T_est, T_ref))
     scatter = so3_log(R @ T_est[:, :3, :3] @ np.swapaxes(T_ref[:, :3, :3], 1, 2)) @ axis
     angle = np.linalg.norm(so3_log(R @ alignment.R.T))
-    precise = sigma > max(_LOOSE_RAD, _ORIENTATION_GAIN * np.sqrt(np.mean(scatter**2)))
-    if not precise or angle > _CONTRADICTION * sigma:
+    precise = sigma > max(_RULES.loose_rad, _RULES.orientation_gain * np.sqrt(np.mean(scatter**2)))
+    if not precise or angle > _RULES.contradiction * sigma:
         return alignment
     t = T_ref[:, :3, 3].mean(axis=0) - alignment.scale * (R @ T_est[:, :3, 3].mean(axis=0))
     return Alignment(R, t, alignment.scale, "direction and orientations")
@@ -142,7 +151,7 @@ def _extent(p: FloatArray) -> float:
     coordinates.
     """
     extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
-    return extent if extent > _STATIONARY * float(np.abs(p).max()) else 0.0
+    return extent if extent > _RULES.stationary * float(np.abs(p).max()) else 0.0
 
 
 def _orientation_sum(T_est: FloatArray, T_ref: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ axes, another order.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -21,18 +22,27 @@ from vio.numerics.robust import median
 # median attitude error that no odometry has whose positions agree; other axes are 90 deg off or
 # more
 _LARGE_DEG = 20.0
-_CONSTANT = 0.2  # of that error may vary where one rotation explains it
+
+
+@dataclass(frozen=True, slots=True)
+class _AxisRules:
+    """When another convention of axes explains the errors of attitude."""
+
+    constant: float = 0.2  # of that error may vary where one rotation explains it
+    alike_deg: float = 1e-3  # between what two causes leave: nothing tells which one it is
+    sigmas: float = 5.0  # of the rotation about the path, where the positions leave it uncertain
+    # a rotation so near one of the 24 that exchange axes is called by its whole degrees
+    axes_deg: float = 5.0
+
+
+_RULES = _AxisRules()
 # by which another order of the numbers must explain it better than other axes of the body do
 _BETTER = 3.0
-_ALIKE_DEG = 1e-3  # between what two causes leave: nothing tells which one it is
-_SIGMAS = 5.0  # of the rotation about the path, where the positions leave it uncertain
 _NO_MEASURE = ", so attitude, RPE and drift, which use them, say nothing of the error"
 _ORDERS: dict[Literal["w last", "w first"], str] = {
     "w last": "quaternions with w first, read as if w came last",
     "w first": "quaternions with w last, read as if w came first",
 }
-# a rotation so near one of the 24 that exchange axes is called by its whole degrees
-_AXES_DEG = 5.0
 
 
 def attitude_note(
@@ -53,7 +63,7 @@ def attitude_note(
     R_align = np.eye(3) if R_ref_est is None else R_ref_est
     R_raw = R_align.T @ R_est
     off_deg = median(rotation_angle_deg(np.swapaxes(R_ref, 1, 2) @ R_est))
-    if off_deg < max(_LARGE_DEG, _SIGMAS * float(np.degrees(sigma_rad))):
+    if off_deg < max(_LARGE_DEG, _RULES.sigmas * float(np.degrees(sigma_rad))):
         return None
     head = f"the attitudes differ by {off_deg:.0f} deg (median)"
     if _varies_deg(R_ref) < 1.0 and _varies_deg(R_est) > _LARGE_DEG:
@@ -77,10 +87,10 @@ def attitude_note(
     left = {key: _spread_deg(differences) for key, differences in others.items()}
     best = min(left, key=lambda key: left[key])
     of_body = _spread_deg(body)
-    if min(of_body, left[best]) > _CONSTANT * off_deg:
+    if min(of_body, left[best]) > _RULES.constant * off_deg:
         return f"{head}, and no exchange of axes explains it; check what the reference's orientations mean"
     if _BETTER * left[best] < of_body:
-        alike = [key for key in left if left[key] <= left[best] + _ALIKE_DEG]
+        alike = [key for key in left if left[key] <= left[best] + _RULES.alike_deg]
         causes = ", or ".join(f"the {whose}'s orientations are {words}" for whose, words in alike)
         return f"{head}: {causes}{_NO_MEASURE}; correct the file it was written from"
     return (
@@ -118,7 +128,7 @@ def _name(R: FloatArray) -> str:
     axes = np.rint(R)
     if (
         np.array_equal(np.abs(axes).sum(axis=0), np.ones(3))
-        and float(rotation_angle_deg(axes.T @ R)) < _AXES_DEG
+        and float(rotation_angle_deg(axes.T @ R)) < _RULES.axes_deg
     ):
         signed = (
             ("-" if row.sum() < 0 else "+") + "xyz"[int(np.argmax(np.abs(row)))] for row in axes

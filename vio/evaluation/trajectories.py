@@ -42,14 +42,24 @@ from vio.records import BodyFrame, IntArray, Trajectory
 
 _MILLIMETRES_BELOW_M = 0.01  # lengths in words
 _SHORT_M = 10.0  # over shorter lengths a drift for 100 m says nothing that a reader can picture
-_PATH_RATIO = 1.5  # ratio of path lengths above which the reference may be another recording's
+
+
+@dataclass(frozen=True, slots=True)
+class _SuspicionRules:
+    """When a reference is called one of another unit, clock or recording."""
+
+    # ratio of path lengths above which the reference may be another recording's
+    path_ratio: float = 1.5
+    # a ratio of path lengths so near one of these is no chance; odometry without a scale has any ratio
+    unit_share: float = 0.1
+    path_min_m: float = 1.0  # paths below this may consist of noise
+    matched_share: float = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
+    # span of the matched poses, of the estimate; below, the figures are those of a part
+    matched_estimate: float = 0.2
+
+
+_SUSPECT = _SuspicionRules()
 _UNITS = {"millimetres": 1000.0, "centimetres": 100.0}
-# a ratio of path lengths so near one of these is no chance; odometry without a scale has any ratio
-_UNIT_SHARE = 0.1
-_PATH_MIN_M = 1.0  # paths below this may consist of noise
-_MATCHED_SHARE = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
-# span of the matched poses, of the estimate; below, the figures are those of a part
-_MATCHED_ESTIMATE = 0.2
 # of a position from the origin: farther than the sun, and squares do not overflow
 _FARTHEST_M = 1e12
 # Of an evaluation, as it holds them.
@@ -320,11 +330,11 @@ def _notes(
     """Name signs that the reference belongs to another recording."""
     notes = []
     short, long = sorted((estimate_m, reference_m))
-    if long > _PATH_MIN_M and long > _PATH_RATIO * short:
+    if long > _SUSPECT.path_min_m and long > _SUSPECT.path_ratio * short:
         units = {
             name: size
             for name, size in _UNITS.items()
-            if abs(long / max(short, 1e-12) / size - 1) < _UNIT_SHARE
+            if abs(long / max(short, 1e-12) / size - 1) < _SUSPECT.unit_share
         }
         which = "the reference" if reference_m > estimate_m else "the estimate"
         what = (
@@ -337,13 +347,13 @@ def _notes(
             f"{reference_m:.1f} m; {what}"
         )
     span = float(rows[-1] - rows[0]) / max(len(estimate) - 1, 1)
-    if len(estimate) > 1 and span < _MATCHED_ESTIMATE:
+    if len(estimate) > 1 and span < _SUSPECT.matched_estimate:
         notes.append(
             f"the reference covers {100 * span:.0f} % of the estimate: the figures are those of "
             "this part"
         )
     shorter = min(len(estimate), len(reference))
-    if len(rows) < _MATCHED_SHARE * shorter:
+    if len(rows) < _SUSPECT.matched_share * shorter:
         notes.append(
             f"only {len(rows)} poses match, of {len(estimate)} of the estimate and "
             f"{len(reference)} of the reference; "

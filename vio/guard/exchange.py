@@ -24,14 +24,23 @@ from vio.records import Image
 
 Order: TypeAlias = Literal["given", "exchanged", "refused"]
 
-# width and height, so coarse that a shift of the image by some pixels changes little
-_THUMBNAIL = (48, 30)
-_BLOCK = 4  # averaged first: OpenCV averages whole pixels five times as fast as fractions of them
-_MIN_POINTS = 20
-_MANY = 0.4  # share of points with a negative disparity that proves an exchange
-# share of them above which a frame that looks exchanged is refused: its rows do not fit when put
-# back
-_SOME = 0.2
+
+@dataclass(frozen=True, slots=True)
+class _ExchangeRules:
+    """When images look exchanged, and when matches prove it."""
+
+    # width and height, so coarse that a shift of the image by some pixels changes little
+    thumbnail: tuple[int, int] = (48, 30)
+    # averaged first: OpenCV averages whole pixels five times as fast as fractions of them
+    block: int = 4
+    min_points: int = 20
+    many: float = 0.4  # share of points with a negative disparity that proves an exchange
+    # share of them above which a frame that looks exchanged is refused: its rows do not fit when put
+    # back
+    some: float = 0.2
+
+
+_RULES = _ExchangeRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +91,7 @@ class ExchangeDetector(ImageCheck):
         left, right = images.halves
         points = self._probe.corners(left)
         negative = self._probe.negative(left, right, points)
-        if not exchanged and negative < _SOME * len(points):
+        if not exchanged and negative < _RULES.some * len(points):
             return MatchCounts(len(points), 0, negative)
         return MatchCounts(len(points), self._probe.positive(left, right, points), negative)
 
@@ -145,21 +154,26 @@ class ExchangeDetector(ImageCheck):
 
 def _thumbnail(image: Image) -> Image:
     """A small copy of an image, averaged over areas."""
-    width, height = (size // _BLOCK for size in image.shape[::-1])
-    if width >= _THUMBNAIL[0] and height >= _THUMBNAIL[1]:
-        whole = image[: _BLOCK * height, : _BLOCK * width]
+    width, height = (size // _RULES.block for size in image.shape[::-1])
+    if width >= _RULES.thumbnail[0] and height >= _RULES.thumbnail[1]:
+        whole = image[: _RULES.block * height, : _RULES.block * width]
         image = np.asarray(
             cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
         )
-    return np.asarray(cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return np.asarray(
+        cv2.resize(image, _RULES.thumbnail, interpolation=cv2.INTER_AREA), dtype=np.uint8
+    )
 
 
 def _judge(found: MatchCounts, likely: Order) -> Order:
     """Decide by matches about a frame that looks exchanged; where they are too few, the decision
     is as before.
     """
-    if found.points < _MIN_POINTS or max(found.negative, found.positive) < _SOME * found.points:
+    if (
+        found.points < _RULES.min_points
+        or max(found.negative, found.positive) < _RULES.some * found.points
+    ):
         return likely
     if found.negative < 2 * found.positive:
         return "given"
-    return "exchanged" if found.negative >= _MANY * found.points else "refused"
+    return "exchanged" if found.negative >= _RULES.many * found.points else "refused"

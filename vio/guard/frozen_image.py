@@ -19,18 +19,26 @@ from vio.records import Image
 
 Cause: TypeAlias = Literal["right-image-frozen", "right-image-dark"]
 
-_STRIDE = 4  # of the half-resolution images' pixels that are compared
-# change of a frozen camera's image over that of the other's, at most: sensor noise is left
-_FROZEN_SHARE = 0.3
-# change of a frozen camera's image by noise of the sensor or an encoder, gray levels at the common
-# contrast
-_MAX_NOISE = 3.0
-# the same of the other camera's image: where it changes by less, nothing can be concluded
-_MIN_CHANGE = 1.0
-# how fast the usual ratio of the two changes is learned, which depends on gains and scene
-_RATIO_GAIN = 0.1
-_FRAMES = 3  # in a row before it is reported
-_DARK_SHARE = 0.1  # contrast of a dark or covered image over that of the other one
+
+@dataclass(frozen=True, slots=True)
+class _FrozenRules:
+    """When an image counts as frozen, or as dark."""
+
+    stride: int = 4  # of the half-resolution images' pixels that are compared
+    # change of a frozen camera's image over that of the other's, at most: sensor noise is left
+    frozen_share: float = 0.3
+    # change of a frozen camera's image by noise of the sensor or an encoder, gray levels at the common
+    # contrast
+    max_noise: float = 3.0
+    # the same of the other camera's image: where it changes by less, nothing can be concluded
+    min_change: float = 1.0
+    # how fast the usual ratio of the two changes is learned, which depends on gains and scene
+    ratio_gain: float = 0.1
+    frames: int = 3  # in a row before it is reported
+    dark_share: float = 0.1  # contrast of a dark or covered image over that of the other one
+
+
+_RULES = _FrozenRules()
 
 _SEEN: dict[Cause, str] = {
     "right-image-frozen": "the right camera is frozen: its image does not change while the left "
@@ -81,7 +89,9 @@ class FrozenCamera(ImageCheck):
         A frozen or dark right image is noted: `right_usable` is False then.
         """
         now = _SparseImages(
-            index, left[::_STRIDE, ::_STRIDE].copy(), right[::_STRIDE, ::_STRIDE].copy()
+            index,
+            left[:: _RULES.stride, :: _RULES.stride].copy(),
+            right[:: _RULES.stride, :: _RULES.stride].copy(),
         )
         last = self._last
         if last is None:
@@ -91,7 +101,10 @@ class FrozenCamera(ImageCheck):
             self._count_left(last.index, index)
             return True
         self._end_left(index)
-        if mean_and_contrast(now.right, 1)[1] < _DARK_SHARE * mean_and_contrast(now.left, 1)[1]:
+        if (
+            mean_and_contrast(now.right, 1)[1]
+            < _RULES.dark_share * mean_and_contrast(now.left, 1)[1]
+        ):
             self._distrust("right-image-dark", last.index, index)
             return False
         change_left = image_change(now.left, last.left)
@@ -101,8 +114,8 @@ class FrozenCamera(ImageCheck):
             return False
         if self._cause is not None:
             self._end_right(index)
-        elif change_left > _MIN_CHANGE:
-            self._ratio += _RATIO_GAIN * (change_right / change_left - self._ratio)
+        elif change_left > _RULES.min_change:
+            self._ratio += _RULES.ratio_gain * (change_right / change_left - self._ratio)
         self._last = now
         return False
 
@@ -113,7 +126,7 @@ class FrozenCamera(ImageCheck):
             self._count = 0
         self._cause = cause
         self._count += 1
-        if self._count == _FRAMES:
+        if self._count == _RULES.frames:
             self._reported = cause
             message = (
                 f"frame {index}: {_SEEN[cause]}, since frame {self._since}; going on with the left "
@@ -123,7 +136,7 @@ class FrozenCamera(ImageCheck):
 
     def _end_right(self, index: int) -> None:
         assert self._cause is not None
-        if self._count >= _FRAMES:
+        if self._count >= _RULES.frames:
             message = f"frame {index}: the right camera gives new images again"
             self._found.append(Finding(self._reported, message, index, ended=True))
         self._cause = None
@@ -131,7 +144,7 @@ class FrozenCamera(ImageCheck):
     def _count_left(self, since: int, index: int) -> None:
         """Count frames with a frozen left image, and report it once."""
         self._left_frozen += 1
-        if self._left_frozen == _FRAMES:
+        if self._left_frozen == _RULES.frames:
             message = (
                 f"frame {index}: the left camera is frozen: its image does not change since frame "
                 f"{since} while the right one does; the right images alone follow what the last "
@@ -140,7 +153,7 @@ class FrozenCamera(ImageCheck):
             self._found.append(Finding("left-image-frozen", message, index, since + 1, lasts=True))
 
     def _end_left(self, index: int) -> None:
-        if self._left_frozen >= _FRAMES:
+        if self._left_frozen >= _RULES.frames:
             message = f"frame {index}: the left camera gives new images again"
             self._found.append(Finding("left-image-frozen", message, index, ended=True))
         self._left_frozen = 0
@@ -152,4 +165,6 @@ def _is_frozen(change: float, other_change: float) -> bool:
     """
     if change == 0.0:
         return other_change > 0.0
-    return change < _MAX_NOISE and other_change > max(_MIN_CHANGE, change / _FROZEN_SHARE)
+    return change < _RULES.max_noise and other_change > max(
+        _RULES.min_change, change / _RULES.frozen_share
+    )

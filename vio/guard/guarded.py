@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from vio.findings import Finding
 from vio.geometry.stereo import StereoCamera
 from vio.guard.bands import BandRemoval
@@ -11,10 +9,12 @@ from vio.guard.contrast import LostContrast
 from vio.guard.exchange import ExchangeDetector
 from vio.guard.frozen_image import FrozenCamera
 from vio.guard.image_check import FrameImages, ImageCheck, images_of
+from vio.guard.match_check import without_right
+from vio.guard.matches import RightMatches
 from vio.guard.pairing import PairingCheck
 from vio.guard.probe import RowProbe
 from vio.guard.swap import SwapDetector
-from vio.protocols import FollowsRight, Frontend
+from vio.protocols import ChecksMatches, FollowsRight, Frontend
 from vio.records import (
     FrontendOutput,
     Observations,
@@ -47,15 +47,18 @@ def image_checks(camera: StereoCamera) -> tuple[ImageCheck, ...]:
 
 
 class GuardedFrontend:
-    """Checks the images of each frame before a front end sees them; see `vio.protocols.Frontend`.
+    """Checks the images of each frame before a front end sees them, and its right matches after it;
+    see `vio.protocols.Frontend`.
 
-    Frames without images, and images that no front end takes, are handed on as they are.
+    Images that no front end takes are handed on as they are. A front end that checks its matches
+    itself (`vio.protocols.ChecksMatches`) is not checked again.
     """
 
     def __init__(self, frontend: Frontend, camera: StereoCamera) -> None:
         self.frontend = frontend
         self._pair = camera.kind == "stereo"
         self._checks = image_checks(camera)
+        self._matches = RightMatches(camera)
         self._swap = next((c for c in self._checks if isinstance(c, SwapDetector)), None)
         self._exchange = next((c for c in self._checks if isinstance(c, ExchangeDetector)), None)
 
@@ -67,7 +70,8 @@ class GuardedFrontend:
         """
         images = images_of(frame, pair=self._pair)
         if images is None:
-            return self.frontend.process(frame, prior)
+            output = self.frontend.process(frame, prior)
+            return self._checked(output, (), right_usable=True)
         images = self._inspect(images)
         output = self._output(images, prior)
         if self._exchange is not None and images.right_usable:
@@ -75,7 +79,24 @@ class GuardedFrontend:
             known = self._swap is not None and self._swap.decided
             self._exchange.suspicious = known and _few_matches(output.observations)
         found = tuple(f for check in self._checks for f in check.take_findings())
-        return _with_findings(output, found, right_usable=images.right_usable)
+        return self._checked(output, found, right_usable=images.right_usable)
+
+    def _checked(
+        self, output: FrontendOutput, found: tuple[Finding, ...], *, right_usable: bool
+    ) -> FrontendOutput:
+        """Return an output after the checks of its right matches, with findings `found` before
+        them.
+
+        Without a usable right image there is nothing to check.
+        """
+        frontend = self.frontend
+        seen = output.observations
+        if not right_usable:
+            seen = without_right(seen)
+        elif not (isinstance(frontend, ChecksMatches) and frontend.checks_matches):
+            seen = self._matches.inspect(seen)
+            found = (*found, *self._matches.take_findings())
+        return _with_findings(output, seen, found)
 
     def _inspect(self, images: FrameImages) -> FrameImages:
         """Return the images after all checks, up to the first that leaves the frame out."""
@@ -110,16 +131,10 @@ def _few_matches(seen: Observations) -> bool:
 
 
 def _with_findings(
-    output: FrontendOutput, found: tuple[Finding, ...], *, right_usable: bool
+    output: FrontendOutput, seen: Observations, found: tuple[Finding, ...]
 ) -> FrontendOutput:
-    """Return an output with findings, and without right pixels where these are not usable."""
-    seen = output.observations
-    if not right_usable and seen.has_right.any():
-        none = np.zeros(len(seen), dtype=np.bool_)
-        seen = Observations(
-            seen.frame_index, seen.time_ns, seen.ids, seen.z, none, seen.stale, seen.sigma
-        )
-    elif not found:
+    """Return an output with other observations and with findings; itself where neither changes."""
+    if seen is output.observations and not found:
         return output
     return FrontendOutput(
         seen,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vio.datasets.rigs.plausible import FAR_IMU_M
@@ -11,23 +13,31 @@ from vio.monitor.accelerometer import judge_up
 from vio.monitor.samples import judge_size
 from vio.records import NS_PER_S, BoolArray, ImuDensities, ImuRecord
 
-_WINDOW_S = 0.5  # over which standstill is judged
-_STILL_GYRO = 0.02  # rad/s, m/s^2: spread within a window; ten times the noise of usual sensors
-_STILL_ACCEL = 0.15
+
+@dataclass(frozen=True, slots=True)
+class _StillRules:
+    """When an IMU stands still for long enough to measure its noise."""
+
+    window_s: float = 0.5  # over which standstill is judged
+    gyro: float = 0.02  # rad/s, m/s^2: spread within a window; ten times the noise of usual sensors
+    accel: float = 0.15
+    min_still_s: float = 3.0  # of one piece, for the noise
+
+
+_STILL = _StillRules()
 # Allan deviations where white noise outweighs quantisation and bias drift
 _NOISE_TAUS_S = (0.1, 0.2, 0.5)
-_MIN_STILL_S = 3.0  # of one piece, for the noise
 _OFF_SHEET = 3.0  # measured over stated noise that is worth saying
 
 
 def still_windows(record: ImuRecord) -> tuple[BoolArray, int]:
     """Return which windows of the record are at rest (W,), and the samples in each."""
     rate_hz = NS_PER_S / float(np.median(np.diff(record.times_ns)))
-    size = max(round(_WINDOW_S * rate_hz), 4)
+    size = max(round(_STILL.window_s * rate_hz), 4)
     count = len(record.times_ns) // size
     gyro, accel = (v[: count * size].reshape(count, size, 3) for v in (record.gyro, record.accel))
-    quiet = (np.linalg.norm(gyro.std(axis=1), axis=1) < _STILL_GYRO) & (
-        np.linalg.norm(accel.std(axis=1), axis=1) < _STILL_ACCEL
+    quiet = (np.linalg.norm(gyro.std(axis=1), axis=1) < _STILL.gyro) & (
+        np.linalg.norm(accel.std(axis=1), axis=1) < _STILL.accel
     )
     return quiet, size
 
@@ -84,7 +94,7 @@ def noise_part(record: ImuRecord, stated: ImuDensities | None) -> Part | None:
     step_s = float(np.median(np.diff(record.times_ns))) / NS_PER_S
     runs = [(a, b) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)]
     longest = max(runs, key=lambda r: r[1] - r[0], default=(0, 0))
-    if (longest[1] - longest[0]) * size * step_s < _MIN_STILL_S:
+    if (longest[1] - longest[0]) * size * step_s < _STILL.min_still_s:
         return None
     piece = slice(longest[0] * size, longest[1] * size)
     facts: dict[str, float | None] = {}

@@ -65,6 +65,7 @@ class Source:
     recording: Recording | None = None  # None: live
     # the recording, or the features used in place of its images; None: live
     features: Dataset | None = None
+    right_delay: int = 0  # frames by which right images and pixels are known to be late
 
 
 def recorded_source(dataset: Dataset, config: Config) -> Source:
@@ -184,6 +185,7 @@ def build_processor(
         DataError: the map cannot be used.
     """
     from vio.frontend.given import as_frontend  # they load OpenCV
+    from vio.frontend.precomputed import PrecomputedFrontend
     from vio.guard.guarded import guarded
 
     camera = source.camera
@@ -200,6 +202,8 @@ def build_processor(
         if parts.frontend is None
         else as_frontend(parts.frontend, seen, config.frontend)
     )
+    if isinstance(frontend, PrecomputedFrontend):
+        frontend.right_delay = source.right_delay
     pipeline = FramePipeline(
         camera,
         source.T_cam0_body,

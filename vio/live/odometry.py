@@ -27,7 +27,7 @@ from vio.live.event_inputs import EventInputs
 from vio.live.inputs import GivenFrame, Inputs, Shapes, checked_time, gray
 from vio.live.prediction import PosePredictor, PredictedPose
 from vio.numerics.threads import BlasLimit
-from vio.protocols import FollowsRight, Frontend
+from vio.protocols import ChecksMatches, FollowsRight, Frontend
 from vio.records import (
     CheckedFrame,
     Estimate,
@@ -387,16 +387,23 @@ class _LiveFrontend:
         self.given: dict[int, Observations] = {}  # by frame, until it is processed
         self._replay = PrecomputedFrontend(lambda index: self.given.pop(index, None))
         self._images: Frontend | None = None
+        self._last: Frontend = self._replay  # that processed the last frame
 
     def open(self) -> None:
         """Build the front end for images, which observations do not need."""
         if self._images is None:
             self._images = build_frontend(self._settings.name, self._camera, self._settings)
 
+    @property
+    def checks_matches(self) -> bool:
+        """Whether the front end of the last frame does; see `vio.protocols.ChecksMatches`."""
+        return isinstance(self._last, ChecksMatches) and self._last.checks_matches
+
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Process a frame, see `Frontend`."""
         frontend = self._replay if frame.left is None else self._images
         assert frontend is not None
+        self._last = frontend
         return frontend.process(frame, prior)
 
     def follow_right(self, frame: CheckedFrame, prior: TrackPrior | None = None) -> FrontendOutput:

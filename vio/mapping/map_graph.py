@@ -29,11 +29,21 @@ from vio.records import BoolArray, IntArray
 # along the path: 1 % and 0.5 deg/100 m; peers reach 1.2 % and 0.3 deg/100 m with stereo on KITTI.
 _DRIFT_SHARE = 0.01
 _DRIFT_RAD_PER_M = float(np.radians(0.005))
-_FIRST_REACH = 30.0  # of the search for them, in mean variances of a motion; and from try to try
-_FURTHER = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class _GraphRules:
+    """How many keyframes take part in an optimisation."""
+
+    # of the search for them, in mean variances of a motion; and from try to try
+    first_reach: float = 30.0
+    further: float = 2.0
+    max_exact: int = 200  # keyframes whose covariance is computed, beside the first of each session
+    min_variance_m2: float = 1e-8  # of a keyframe's position since its session began
+
+
+_GRAPH = _GraphRules()
 _WINDOW = 1000  # keyframes that are optimised for a new loop, beside those of its cycle
-_MAX_EXACT = 200  # keyframes whose covariance is computed, beside the first of each session
-_MIN_VARIANCE_M2 = 1e-8  # of a keyframe's position since its session began
 # variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
 UNKNOWN = 1e6
 
@@ -280,7 +290,7 @@ class MapGraph:
             self.drift(begins, numbers, systematic=0.0)[:, :3, :3], axis1=1, axis2=2
         )
         w = np.zeros(len(self))
-        w[numbers] = 1.0 / (variance + np.median(variance) + _MIN_VARIANCE_M2)
+        w[numbers] = 1.0 / (variance + np.median(variance) + _GRAPH.min_variance_m2)
         return w / w.sum()
 
     def placed(self, part: int, stays: BoolArray, before: Placed | None) -> Placed:
@@ -325,7 +335,7 @@ class MapGraph:
         if not len(numbers):
             return np.zeros((0, 6, 6))
         begins = np.unique(self.session[numbers], return_index=True)[1]
-        few = np.linspace(0, len(numbers) - 1, min(_MAX_EXACT, len(numbers))).astype(np.int64)
+        few = np.linspace(0, len(numbers) - 1, min(_GRAPH.max_exact, len(numbers))).astype(np.int64)
         exact = np.union1d(begins, few)
         P = self._marginals(rows, exact)
         T = self.T_map_cam.rows[rows]
@@ -452,7 +462,7 @@ def _nearest(links: coo_matrix, new: Sequence[LoopRow], rows: BoolArray) -> IntA
         rows: (K,) keyframes that may be taken.
     """
     ends = [k for o in new for k in (o.first, o.second)]
-    reach = _FIRST_REACH * float(links.data.mean())
+    reach = _GRAPH.first_reach * float(links.data.mean())
     both = (links + links.T).tocsr()
     while True:
         away = np.stack([dijkstra(both, indices=k, limit=reach) for k in ends])
@@ -470,4 +480,4 @@ def _nearest(links: coo_matrix, new: Sequence[LoopRow], rows: BoolArray) -> IntA
             joined.all() and nearest[chosen[-1]] <= 2 * (reach - float(least.max()))
         ):
             return chosen[np.isfinite(nearest[chosen])]
-        reach = _FURTHER * reach if reach < links.data.sum() else np.inf
+        reach = _GRAPH.further * reach if reach < links.data.sum() else np.inf

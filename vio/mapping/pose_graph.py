@@ -30,11 +30,19 @@ from vio.numerics.robust import truncated_weights
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
-_TRUNCATION = 0.999  # probability at which a loop's residual is cut off
-_MU_GROWTH = 1.6  # of the control parameter, from one step to the next
-_MAX_STEPS = 15
-_MAX_GNC_STEPS = 30
-_CONVERGED = 1e-6  # largest change, m and rad
+
+@dataclass(frozen=True, slots=True)
+class _GncRules:
+    """Graduated non-convexity."""
+
+    truncation: float = 0.999  # probability at which a loop's residual is cut off
+    mu_growth: float = 1.6  # of the control parameter, from one step to the next
+    max_steps: int = 15
+    max_gnc_steps: int = 30
+    converged: float = 1e-6  # largest change, m and rad
+
+
+_GNC = _GncRules()
 # by which (G7) weighs an error xi: |R - R'|_F^2 = 2 |phi|^2
 _FRAME_METRIC = np.repeat([1.0, 2.0], 3)
 
@@ -102,29 +110,29 @@ def optimise(
             pitch follow the up_directions; None: all of them stay.
     """
     free = _Free(fixed, levelled)
-    limit = float(chi_square_quantile(_TRUNCATION, 6))
+    limit = float(chi_square_quantile(_GNC.truncation, 6))
     T = T_map_cam.copy()
     weight = np.ones(len(loops))
     if not len(loops):
         return Optimum(
-            _descend(T, odometry, loops, weight, up_directions, free, _MAX_STEPS),
+            _descend(T, odometry, loops, weight, up_directions, free, _GNC.max_steps),
             weight > 0.5,
             weight,
         )
-    T = _descend(T, odometry, loops, weight, up_directions, free, _MAX_STEPS)
+    T = _descend(T, odometry, loops, weight, up_directions, free, _GNC.max_steps)
     squared = _squared(T, loops)
     worst = float(squared.max())
     if worst > limit:  # else every loop fits with full weight, and there is nothing to decide
         mu = limit / (2 * worst - limit)
-        for _ in range(_MAX_GNC_STEPS):
+        for _ in range(_GNC.max_gnc_steps):
             weight = truncated_weights(squared, mu, limit)
             T = _descend(T, odometry, loops, weight, up_directions, free, 2)
             squared = _squared(T, loops)
             if ((weight == 0) | (weight == 1)).all() and mu > 1:
                 break
-            mu *= _MU_GROWTH
+            mu *= _GNC.mu_growth
         weight = (squared < limit).astype(np.float64)
-        T = _descend(T, odometry, loops, weight, up_directions, free, _MAX_STEPS)
+        T = _descend(T, odometry, loops, weight, up_directions, free, _GNC.max_steps)
     return Optimum(T, weight > 0.5, weight)
 
 
@@ -198,7 +206,7 @@ def _descend(
     for _ in range(steps):
         xi = _step(T, odometry, loops, weight, up_directions, free)
         T = T @ se3_exp(xi)
-        if np.abs(xi).max(initial=0.0) < _CONVERGED:
+        if np.abs(xi).max(initial=0.0) < _GNC.converged:
             break
     return T
 

@@ -51,10 +51,18 @@ from vio.records import BoolArray, FeatureTracks, IntArray, MotionSample, Record
 
 log = logging.getLogger(__name__)
 
-_SEGMENT = 36  # frames, pieces, keyframes of each, for the rig in motion
-_SEGMENTS = 6
-_SEGMENT_KEYFRAMES = 20
-_SEGMENT_GATE_PX = 8.0  # wide: wrong extrinsics displace every point
+
+@dataclass(frozen=True, slots=True)
+class _Segments:
+    """Pieces of a recording that calibrate the rig in motion."""
+
+    segment: int = 36  # frames, pieces, keyframes of each, for the rig in motion
+    segments: int = 6
+    keyframes: int = 20
+    gate_px: float = 8.0  # wide: wrong extrinsics displace every point
+
+
+_IN_MOTION = _Segments()
 # What the gate leaves of a camera that is far off is biased: it is measured again with what was
 # found taken out, until less than this is left.
 _ROUNDS = 5
@@ -326,15 +334,15 @@ def _segments(
     motion = stereo_twists(camera, tracks, times_ns, np.zeros((len(times_ns) - 1, 6)))
     out = []
     for piece in tracked_segments(
-        source.path, camera, tracks, motion, longest=_SEGMENT, most=_SEGMENTS
+        source.path, camera, tracks, motion, longest=_IN_MOTION.segment, most=_IN_MOTION.segments
     ):
         try:
-            keyframes = choose_keyframes(piece, most=_SEGMENT_KEYFRAMES)
+            keyframes = choose_keyframes(piece, most=_IN_MOTION.keyframes)
             T_world_cam0 = piece.trajectory.T_world_body[keyframes]
             out.append(
                 Segment(
                     T_world_cam0,
-                    build_tracks(piece, keyframes, T_world_cam0, gate_px=_SEGMENT_GATE_PX),
+                    build_tracks(piece, keyframes, T_world_cam0, gate_px=_IN_MOTION.gate_px),
                 )
             )
         except EstimationError as error:

@@ -18,16 +18,33 @@ from vio.numerics.robust import robust_sigma
 from vio.offline.keyframes import TrackedPath
 from vio.records import BoolArray, IntArray, Trajectory
 
-_SCALE_SIGMA = 0.02  # a scale with a larger standard deviation is not reported
-_MIN_MOTIONS = 8  # keyframes needed to detect outlying motions
-_OUTLYING = 6.0  # robust standard deviations
-# What COLMAP's own path may be off by at its end, beside the run's standard deviations.
-_END_SHARE = 0.01
-_END_DEG = 0.5
-_END_DEG_PER_M = 0.01
-_END_SIGMAS = 3.0
-# of the motion between two keyframes: beyond it, one of both trajectories has jumped there
-_BROKEN = 1.0
+
+@dataclass(frozen=True, slots=True)
+class _MotionRules:
+    """How motions of two reconstructions are compared."""
+
+    scale_sigma: float = 0.02  # a scale with a larger standard deviation is not reported
+    min_motions: int = 8  # keyframes needed to detect outlying motions
+    outlying: float = 6.0  # robust standard deviations
+    # of the motion between two keyframes: beyond it, one of both trajectories has jumped there
+    broken: float = 1.0
+
+
+_MOTIONS = _MotionRules()
+
+
+@dataclass(frozen=True, slots=True)
+class _EndRules:
+    """When the ends of two paths count as apart."""
+
+    # What COLMAP's own path may be off by at its end, beside the run's standard deviations.
+    share: float = 0.01
+    deg: float = 0.5
+    deg_per_m: float = 0.01
+    sigmas: float = 3.0
+
+
+_END = _EndRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,8 +179,8 @@ def _expected_end(run: TrackedPath, ends: IntArray, path_m: float) -> tuple[floa
     COLMAP's, m and degrees.
     """
     sigma_m, sigma_deg = (0.0, 0.0) if run.sigmas is None else run.sigmas[ends[1]].tolist()
-    by_colmap = _END_SHARE * path_m, _END_DEG + _END_DEG_PER_M * path_m
-    return _END_SIGMAS * sigma_m + by_colmap[0], _END_SIGMAS * sigma_deg + by_colmap[1]
+    by_colmap = _END.share * path_m, _END.deg + _END.deg_per_m * path_m
+    return _END.sigmas * sigma_m + by_colmap[0], _END.sigmas * sigma_deg + by_colmap[1]
 
 
 def aligned_distance_m(T_other: FloatArray, T_own: FloatArray) -> float:
@@ -190,7 +207,7 @@ def _scale_ratio(
         return None, None, "the camera does not move (pure rotation or standstill)"
     residual = apply_alignment(alignment, T_other)[:, :3, 3] - p
     sigma = float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))) / (extent * np.sqrt(len(p)))
-    if sigma > _SCALE_SIGMA:
+    if sigma > _MOTIONS.scale_sigma:
         return (
             None,
             None,
@@ -205,7 +222,7 @@ def _disagreements(
     """Return segments where motions between neighbouring keyframes, where there is no gap,
     differ by outliers.
     """
-    if linked.sum() < _MIN_MOTIONS - 1:
+    if linked.sum() < _MOTIONS.min_motions - 1:
         return ()
     off_m, off_deg = motion_differences(T_own, T_other)
     bad = _stands_out(off_m, linked) | _stands_out(off_deg, linked)
@@ -224,12 +241,12 @@ def _longest_piece(
 
     And how many there are between gaps.
     """
-    if len(T_own) < _MIN_MOTIONS and linked.all():
+    if len(T_own) < _MOTIONS.min_motions and linked.all():
         return np.ones(len(T_own), dtype=bool), 1
     moved_m = np.linalg.norm(np.diff(T_own[:, :3, 3], axis=0), axis=1)
     off_m, _ = motion_differences(T_own, T_other)
     broken = ~linked | _stands_out(off_m, linked) & (
-        off_m > _BROKEN * np.maximum(moved_m, np.median(moved_m))
+        off_m > _MOTIONS.broken * np.maximum(moved_m, np.median(moved_m))
     )
     number = np.concatenate([[0], np.cumsum(broken)])
     piece: BoolArray = number == np.bincount(number).argmax()
@@ -255,7 +272,7 @@ def _stands_out(values: FloatArray, linked: BoolArray) -> BoolArray:
         return np.zeros_like(linked)
     middle = float(np.median(usual))
     return linked & (
-        values > middle + _OUTLYING * max(robust_sigma(usual - middle), 0.1 * middle, 1e-9)
+        values > middle + _MOTIONS.outlying * max(robust_sigma(usual - middle), 0.1 * middle, 1e-9)
     )
 
 

@@ -28,12 +28,21 @@ from vio.runs.finished import point_positions, up_of_odometry
 from vio.runs.mapped import corrected, read_trajectories
 from vio.runs.stated import read_metrics
 
-_VOXEL_SHARE = 1 / 250  # of the landmarks' depth, at least
-# of the landmarks' depth: motion from one image that is used to the next; or turn
-_STEP_SHARE = 0.02
-_STEP_DEG = 4.0
-_NEAR_QUANTILE = 0.25  # of the depths of landmarks
-_LEVEL = 0.9998  # z of the upward direction, 1.1 degrees, above which a map's z is taken for up
+
+@dataclass(frozen=True, slots=True)
+class _MeshRules:
+    """Which depths a mesh is made of."""
+
+    voxel_share: float = 1 / 250  # of the landmarks' depth, at least
+    # of the landmarks' depth: motion from one image that is used to the next; or turn
+    step_share: float = 0.02
+    step_deg: float = 4.0
+    near_quantile: float = 0.25  # of the depths of landmarks
+    # z of the upward direction, 1.1 degrees, above which a map's z is taken for up
+    level: float = 0.9998
+
+
+_RULES = _MeshRules()
 _SIGMA_VOXELS = float(TRUNCATION)  # of a depth, beyond which it is not used
 
 
@@ -98,9 +107,11 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
         if map_file is None
         else _poses_in_map(map_file, by_odometry)
     )
-    depth_m = _landmark_depth_m(folder, T_odom, None if voxel_m is None else voxel_m / _VOXEL_SHARE)
+    depth_m = _landmark_depth_m(
+        folder, T_odom, None if voxel_m is None else voxel_m / _RULES.voxel_share
+    )
     voxel_m = _voxel_m(images.camera, depth_m) if voxel_m is None else voxel_m
-    chosen = np.array(after_motion(T, _STEP_SHARE * depth_m, _STEP_DEG), dtype=np.int64)
+    chosen = np.array(after_motion(T, _RULES.step_share * depth_m, _RULES.step_deg), dtype=np.int64)
     up = up_of_odometry(folder, metrics)
     if up is not None:
         up = up_in(T, T_odom, up)
@@ -154,7 +165,7 @@ def build_mesh(
             "voxels with --voxel, and see whether the run's poses are right"
         )
     R = upright_axes(made_from.T_world_cam0, made_from.up_world)
-    if made_from.up_world is not None and made_from.up_world[2] > _LEVEL:
+    if made_from.up_world is not None and made_from.up_world[2] > _RULES.level:
         R = np.eye(3)  # the floor plan is in the run's own frame, whose z is up
     picture = preview(mesh, made_from.T_world_cam0[:done, :3, 3], R, voxel_m)
     return DenseMap(mesh, occupancy_grid(mesh, R, voxel_m), picture, R, done, blocks)
@@ -211,7 +222,7 @@ def _landmark_depth_m(folder: Path, T_world_cam0: FloatArray, otherwise_m: float
         transform_points(se3_inverse(T), p)[:, 2]
         for T in T_world_cam0[:: max(1, len(T_world_cam0) // 50)]
     ]
-    ahead = [float(np.quantile(z[z > 0], _NEAR_QUANTILE)) for z in depths if (z > 0).any()]
+    ahead = [float(np.quantile(z[z > 0], _RULES.near_quantile)) for z in depths if (z > 0).any()]
     if not ahead and otherwise_m is not None:
         return otherwise_m
     if not ahead:
@@ -226,7 +237,7 @@ def _voxel_m(camera: StereoCamera, depth_m: float) -> float:
     """Return voxels with which surfaces are used at twice the landmarks' depth: 1, 2 or 5 times
     a power of ten.
     """
-    length_m = max(_VOXEL_SHARE * depth_m, depth_sigma_m(camera, 2 * depth_m) / _SIGMA_VOXELS)
+    length_m = max(_RULES.voxel_share * depth_m, depth_sigma_m(camera, 2 * depth_m) / _SIGMA_VOXELS)
     power = 10.0 ** np.floor(np.log10(length_m))
     return float(power * max(m for m in (1, 2, 5) if m * power <= length_m * (1 + 1e-9)))
 

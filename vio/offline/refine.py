@@ -226,9 +226,17 @@ def _estimator_settings(path: Path) -> Config:
     return merge(Config(), kept, where=str(path))
 
 
-_POSE_STEPS = 12
-_MIN_ROWS = 6
-_MIN_SIGMA_M = 1e-4  # of a prior: the first pose of a filter has no uncertainty by definition
+@dataclass(frozen=True, slots=True)
+class _PriorRules:
+    """Which rows a prior of poses is made of."""
+
+    pose_steps: int = 12
+    min_rows: int = 6
+    # of a prior: the first pose of a filter has no uncertainty by definition
+    min_sigma_m: float = 1e-4
+
+
+_PRIOR = _PriorRules()
 
 
 def align_to_points(
@@ -245,7 +253,7 @@ def align_to_points(
     """
     T_cam0_world = se3_inverse(T_world_cam0)
     weight = np.zeros(len(z))
-    for step in range(_POSE_STEPS):
+    for step in range(_PRIOR.pose_steps):
         q = transform_points(T_cam0_world, p_world)
         ahead = q[:, 2] > MIN_DEPTH_M
         q = np.where(ahead[:, None], q, [0.0, 0.0, 1.0])
@@ -256,7 +264,7 @@ def align_to_points(
         H[~has_right, 2:] = 0
         width = 2.0 ** max(4 - step, 0)
         weight = ahead / (1 + np.sum(r**2, axis=1) / width**2) ** 2
-        if (weight > 0.25).sum() < _MIN_ROWS:
+        if (weight > 0.25).sum() < _PRIOR.min_rows:
             return None
         weighted = H * weight[:, None, None]
         normal = np.einsum("nki,nkj->ij", weighted, H)
@@ -307,4 +315,4 @@ def position_covariances(estimates: Sequence[Estimate], T_cam0_imu: FloatArray) 
     R = np.array([e.T_world_imu[:3, :3] for e in estimates])
     P = np.array([e.covariance for e in estimates])
     J = R @ p_D_xi
-    return J @ P @ np.swapaxes(J, 1, 2) + _MIN_SIGMA_M**2 * np.eye(3)
+    return J @ P @ np.swapaxes(J, 1, 2) + _PRIOR.min_sigma_m**2 * np.eye(3)

@@ -236,7 +236,7 @@ def _process(what: _Run, delay: int) -> RunResult:
     control = what.control
     recording = dataset.recording
     folder = control.folder
-    source = recorded_source(dataset, config)
+    source = replace(recorded_source(dataset, config), right_delay=delay)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
     began = time.perf_counter()
     recorder = RunRecorder(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -172,10 +172,17 @@ def description(recording: SimulatedRecording) -> str:
     return json.dumps(facts, indent=2, default=np.ndarray.tolist) + "\n"
 
 
-_FACTOR = 5000  # levels per metre, as TUM's
-_NOISE = 1.5e-3  # 1/m, k of a depth's standard deviation k z^2: structured light
-_NEAREST_M = 0.4  # beyond them such a sensor gives none
-_FARTHEST_M = 8.0
+@dataclass(frozen=True, slots=True)
+class _DepthSensor:
+    """A depth camera of structured light."""
+
+    factor: int = 5000  # levels per metre, as TUM's
+    noise: float = 1.5e-3  # 1/m, k of a depth's standard deviation k z^2: structured light
+    nearest_m: float = 0.4  # beyond them such a sensor gives none
+    farthest_m: float = 8.0
+
+
+_DEPTH = _DepthSensor()
 
 
 def export_rgbd(
@@ -197,7 +204,7 @@ def export_rgbd(
     simulation = recording.simulation
     T_cam0_imu = se3_inverse(simulation.calibration.T_imu_cam0)
     T_stated = None if simulation.imu is None else T_cam0_imu
-    rig = Rig(simulation.calibration.cam0, T_cam0_imu=T_stated, depth_factor=_FACTOR)
+    rig = Rig(simulation.calibration.cam0, T_cam0_imu=T_stated, depth_factor=_DEPTH.factor)
     truth = (
         recording.reference
         if simulation.imu is not None
@@ -230,6 +237,6 @@ def export_rgbd(
 def _levels(depth_m: FloatArray, rng: np.random.Generator) -> np.ndarray:
     """A depth image (H, W) of 16 bits with a sensor's noise and range."""
     z = np.where(np.isfinite(depth_m), depth_m, 0.0)
-    noisy = z + rng.normal(size=z.shape) * _NOISE * z**2
-    inside = (z > _NEAREST_M) & (z < _FARTHEST_M)
-    return np.rint(np.where(inside, noisy, 0.0) * _FACTOR).astype(np.uint16)
+    noisy = z + rng.normal(size=z.shape) * _DEPTH.noise * z**2
+    inside = (z > _DEPTH.nearest_m) & (z < _DEPTH.farthest_m)
+    return np.rint(np.where(inside, noisy, 0.0) * _DEPTH.factor).astype(np.uint16)

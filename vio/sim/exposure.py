@@ -22,15 +22,24 @@ from vio.sim.motion import MotionSpline, motion_at
 from vio.sim.render import cast
 from vio.sim.world import World, surfaces_at
 
-_GRID = (12, 8)  # metered rays across and down
-_EVERY = 3  # frames between changes of the exposure, and from an image to the change it causes
-_LATENCY = 2
-_DEAD_BAND = 0.1  # octaves of brightness that are left alone
-_SPEED = 0.6  # share of the error taken back at once, and the most, octaves
-_LARGEST_STEP = 0.6
-_GAIN_STEP = 2**0.5
-_GAIN_ERROR = 0.05  # standard deviation of a gain step's true value, relative
-_SHORTEST_MS = 0.02
+
+@dataclass(frozen=True, slots=True)
+class _ExposureControl:
+    """The automatic exposure of a simulated camera."""
+
+    grid: tuple[int, int] = (12, 8)  # metered rays across and down
+    # frames between changes of the exposure, and from an image to the change it causes
+    every: int = 3
+    latency: int = 2
+    dead_band: float = 0.1  # octaves of brightness that are left alone
+    speed: float = 0.6  # share of the error taken back at once, and the most, octaves
+    largest_step: float = 0.6
+    gain_step: float = 2**0.5
+    gain_error: float = 0.05  # standard deviation of a gain step's true value, relative
+    shortest_ms: float = 0.02
+
+
+_CONTROL = _ExposureControl()
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +93,7 @@ def _meter(
     """Radiance (F, M) along a grid of rays."""
     u, v = (
         (np.arange(n) + 0.5) / n * side
-        for n, side in zip(_GRID, (camera.width, camera.height), strict=True)
+        for n, side in zip(_CONTROL.grid, (camera.width, camera.height), strict=True)
     )
     rays, found = unproject_pixel(camera, np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
     rays = rays[found]
@@ -106,26 +115,28 @@ def _control(
     """
     rng = np.random.default_rng([seed, camera, 61])
     target = effects.exposure_target * camera_factor(effects, camera, seed)
-    phase = int(rng.integers(_EVERY))
-    steps = int(np.log(effects.gain_max) / np.log(_GAIN_STEP) + 1e-9)
-    true_gain = _GAIN_STEP ** np.arange(steps + 1) * (
-        1 + _GAIN_ERROR * rng.standard_normal(steps + 1)
+    phase = int(rng.integers(_CONTROL.every))
+    steps = int(np.log(effects.gain_max) / np.log(_CONTROL.gain_step) + 1e-9)
+    true_gain = _CONTROL.gain_step ** np.arange(steps + 1) * (
+        1 + _CONTROL.gain_error * rng.standard_normal(steps + 1)
     )
     true_gain[0] = 1.0
     per_ms = sensitivity(effects, camera) / effects.shutter_ms
-    limits = np.log2([_SHORTEST_MS, effects.shutter_max_ms * _GAIN_STEP**steps])
+    limits = np.log2([_CONTROL.shortest_ms, effects.shutter_max_ms * _CONTROL.gain_step**steps])
     # octaves of 1 ms at gain 1
     wanted = float(np.log2(target / max(float(radiance[0].mean()) * per_ms, 1e-6)))
     rows: list[tuple[float, float, float]] = []
     for k, seen in enumerate(radiance):
-        if k >= _LATENCY and k % _EVERY == phase:
-            error = float(np.log2(target / max(rows[k - _LATENCY][2], 1.0)))
-            if abs(error) > _DEAD_BAND:
-                wanted += float(np.clip(_SPEED * error, -_LARGEST_STEP, _LARGEST_STEP))
+        if k >= _CONTROL.latency and k % _CONTROL.every == phase:
+            error = float(np.log2(target / max(rows[k - _CONTROL.latency][2], 1.0)))
+            if abs(error) > _CONTROL.dead_band:
+                wanted += float(
+                    np.clip(_CONTROL.speed * error, -_CONTROL.largest_step, _CONTROL.largest_step)
+                )
         wanted = float(np.clip(wanted, *limits))
-        missing = np.log(2**wanted / effects.shutter_max_ms) / np.log(_GAIN_STEP)
+        missing = np.log(2**wanted / effects.shutter_max_ms) / np.log(_CONTROL.gain_step)
         step = int(np.clip(np.ceil(missing - 1e-9), 0, steps))
-        shutter = 2**wanted / _GAIN_STEP**step
+        shutter = 2**wanted / _CONTROL.gain_step**step
         gain = float(true_gain[step])
         rows.append((shutter, gain, float(np.minimum(seen * per_ms * shutter * gain, 255).mean())))
     shutters, gains, means = (np.array(column) for column in zip(*rows, strict=True))

@@ -31,14 +31,35 @@ logger = logging.getLogger(__name__)
 _S_PER_NS = 1e-9
 _DEGREE = 5
 _K = _DEGREE + 1  # control points that a pose depends on
-_SPEED_MPS = 10.0  # of a car on straights
-_ACCELERATION_MPS2 = 2.0  # of a car along the road, at most
-_RAMP_S = 2.0  # from standstill to full speed of a hand-held rig
-_ROBUST_ROUNDS = 8
-_OUTLIER_SIGMAS = 5.0
-_OUTLIER_FLOOR = (0.002, 0.01)  # m, rad: smaller residuals are smoothing, not outliers
-_ROTATION_ROUNDS = 12
-_ROTATION_TOLERANCE_RAD = 1e-10
+
+
+@dataclass(frozen=True, slots=True)
+class _CarMotion:
+    """How a simulated car and a hand-held rig begin to move."""
+
+    speed_mps: float = 10.0  # of a car on straights
+    acceleration_mps2: float = 2.0  # of a car along the road, at most
+    ramp_s: float = 2.0  # from standstill to full speed of a hand-held rig
+
+
+_CAR = _CarMotion()
+
+
+@dataclass(frozen=True, slots=True)
+class _SmoothingRules:
+    """How poses are smoothed to a spline."""
+
+    robust_rounds: int = 8
+    outlier_sigmas: float = 5.0
+    outlier_floor: tuple[float, float] = (
+        0.002,
+        0.01,
+    )  # m, rad: smaller residuals are smoothing, not outliers
+    rotation_rounds: int = 12
+    rotation_tolerance_rad: float = 1e-10
+
+
+_SMOOTHING = _SmoothingRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,9 +205,9 @@ def fit_spline(
         return distance, np.linalg.norm(so3_log(np.swapaxes(R, 1, 2) @ T[:, :3, :3]), axis=1)
 
     distance, angle = residuals()
-    for _ in range(_ROBUST_ROUNDS if robust else 0):
-        good = (distance < _limit(distance[keep], _OUTLIER_FLOOR[0])) & (
-            angle < _limit(angle[keep], _OUTLIER_FLOOR[1])
+    for _ in range(_SMOOTHING.robust_rounds if robust else 0):
+        good = (distance < _limit(distance[keep], _SMOOTHING.outlier_floor[0])) & (
+            angle < _limit(angle[keep], _SMOOTHING.outlier_floor[1])
         )
         if np.array_equal(good, keep):
             break
@@ -242,11 +263,11 @@ def _fit(
     R_control: FloatArray = R[nearest]
     first = A.indices.reshape(-1, _K)[:, 0]
     weights = A.data.reshape(-1, _K)
-    for _ in range(_ROTATION_ROUNDS):
+    for _ in range(_SMOOTHING.rotation_rounds):
         residual = so3_log(np.swapaxes(_attitude(R_control, first, weights), 1, 2) @ R)
         delta = factor.solve(A.T @ residual)
         R_control = R_control @ so3_exp(delta)
-        if np.abs(delta).max() < _ROTATION_TOLERANCE_RAD:
+        if np.abs(delta).max() < _SMOOTHING.rotation_tolerance_rad:
             break
     return p_control, R_control
 
@@ -263,7 +284,7 @@ def _attitude(R_control: FloatArray, first: IntArray, weights: FloatArray) -> Fl
 
 def _limit(kept: FloatArray, floor: float) -> float:
     """Largest residual that still counts as noise."""
-    return max(floor, float(_OUTLIER_SIGMAS * 1.4826 * np.median(kept)))
+    return max(floor, float(_SMOOTHING.outlier_sigmas * 1.4826 * np.median(kept)))
 
 
 def spline_from_waypoints(
@@ -340,7 +361,7 @@ def car_loop(
     for side in (straight[1], straight[0], straight[1], straight[0] / 2):
         curvature[(s >= edge) & (s < edge + np.pi / 2 * corner_m)] = 1 / corner_m
         edge += np.pi / 2 * corner_m + side
-    speed = np.minimum(_SPEED_MPS, np.sqrt(2.5 / np.maximum(curvature, 1e-6)))
+    speed = np.minimum(_CAR.speed_mps, np.sqrt(2.5 / np.maximum(curvature, 1e-6)))
     speed = _smooth_periodic(_limit_acceleration(speed, step), 6.0 / step)
     curvature = _smooth_periodic(curvature, 2.0 / step)
     heading = np.cumsum(curvature) * step
@@ -380,7 +401,7 @@ def _limit_acceleration(speed: FloatArray, step: float) -> FloatArray:
     for order in (range(1, len(square)), range(len(square) - 2, -1, -1)):
         shift = -1 if order.step > 0 else 1
         for i in order:
-            square[i] = min(square[i], square[i + shift] + 2 * _ACCELERATION_MPS2 * step)
+            square[i] = min(square[i], square[i + shift] + 2 * _CAR.acceleration_mps2 * step)
     n = len(speed)
     return np.sqrt(square[n : 2 * n])
 
@@ -447,9 +468,9 @@ def hand_held(
 
 def _ramped_time(t: FloatArray) -> FloatArray:
     """Warped time: its rate grows smoothly (quintic) from 0 at standstill to 1 over the ramp."""
-    u = np.clip(t / _RAMP_S, 0.0, 1.0)
+    u = np.clip(t / _CAR.ramp_s, 0.0, 1.0)
     integral = u**4 * (2.5 + u * (u - 3))  # of 10 u^3 - 15 u^4 + 6 u^5
-    return _RAMP_S * integral + np.maximum(t - _RAMP_S, 0.0)
+    return _CAR.ramp_s * integral + np.maximum(t - _CAR.ramp_s, 0.0)
 
 
 # --- recorded motion

@@ -537,10 +537,17 @@ def flight_files(folder: Path) -> tuple[Path, Path | None, Path | None]:
 READY_MOTIONS: tuple[str, ...] = get_args(ReadyMotion)
 
 
-_RATE_HZ = 10.0
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    """The recording of a drive along a road."""
+
+    rate_hz: float = 10.0
+    start_m: float = 12.0  # the drive then covers a straight, a corner and another straight
+
+
+_DRIVE = _Drive()
 _DURATION_S = 14.0
 _WIDTH_PX = 800
-_START_M = 12.0  # the drive then covers a straight, a corner and another straight
 
 
 def write_demo_recording(out: Path, progress: Progress | None = None) -> Path:
@@ -553,8 +560,8 @@ def write_demo_recording(out: Path, progress: Progress | None = None) -> Path:
     simulation = simulate(
         street(seed=4),
         kitti_like_rig(_WIDTH_PX),
-        car_loop(duration_s=_DURATION_S, start_m=_START_M, seed=4),
-        rate_hz=_RATE_HZ,
+        car_loop(duration_s=_DURATION_S, start_m=_DRIVE.start_m, seed=4),
+        rate_hz=_DRIVE.rate_hz,
         velocity=VelocityNoise(),
         effects=SensorEffects(read_noise=1.5, vignetting=0.2),
         seed=4,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,18 @@ from vio.live.pairing import Pairing
 from vio.records import Image
 from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
 
-_WIDTH = 640
-_HEIGHT = 400
-_RATE_HZ = 20.0
-_IMU_HZ = 200
+
+@dataclass(frozen=True, slots=True)
+class _Streams:
+    """Which streams of the camera are read."""
+
+    width: int = 640
+    height: int = 400
+    rate_hz: float = 20.0
+    imu_hz: int = 200
+
+
+_STREAMS = _Streams()
 # of OpenCV's rational polynomial; the device stores thin prisms and tilt behind them
 _COEFFICIENTS = 8
 _FISHEYE_COEFFICIENTS = 4
@@ -76,7 +85,11 @@ class OakSource:
         self._images = [
             self._pipeline.create(dai.node.Camera)
             .build(socket)
-            .requestOutput((_WIDTH, _HEIGHT), type=dai.ImgFrame.Type.GRAY8, fps=_RATE_HZ)
+            .requestOutput(
+                (_STREAMS.width, _STREAMS.height),
+                type=dai.ImgFrame.Type.GRAY8,
+                fps=_STREAMS.rate_hz,
+            )
             .createOutputQueue()
             for socket in sockets
         ]
@@ -86,7 +99,7 @@ class OakSource:
         if self._device.getConnectedIMU() not in ("", "NONE"):
             node = self._pipeline.create(dai.node.IMU)
             node.enableIMUSensor(
-                [dai.IMUSensor.ACCELEROMETER_RAW, dai.IMUSensor.GYROSCOPE_RAW], _IMU_HZ
+                [dai.IMUSensor.ACCELEROMETER_RAW, dai.IMUSensor.GYROSCOPE_RAW], _STREAMS.imu_hz
             )
             node.setBatchReportThreshold(1)
             node.setMaxBatchReports(10)
@@ -105,7 +118,9 @@ class OakSource:
         Raises:
             DataError: it is none of OpenCV's models, or lacks its coefficients.
         """
-        K = np.array(stored.getCameraIntrinsics(socket, _WIDTH, _HEIGHT), dtype=np.float64)
+        K = np.array(
+            stored.getCameraIntrinsics(socket, _STREAMS.width, _STREAMS.height), dtype=np.float64
+        )
         models = self._dai.CameraModel
         model = stored.getDistortionModel(socket)
         # depthai ends the process where it is asked for those of a fisheye lens that has none
@@ -118,7 +133,9 @@ class OakSource:
                     "--calibration FILE"
                 )
             found = values[:_FISHEYE_COEFFICIENTS]
-            return camera_from_matrix(K, _WIDTH, _HEIGHT, "equidistant", found, self._name)
+            return camera_from_matrix(
+                K, _STREAMS.width, _STREAMS.height, "equidistant", found, self._name
+            )
         if model != models.Perspective:
             raise DataError(
                 f"{self._name}: its lens model {getattr(model, 'name', model)} is not known; give "
@@ -129,7 +146,9 @@ class OakSource:
                 f"{self._name}: its lens model has thin prisms or tilt; give --calibration FILE"
             )
         kind: DistortionModel = "radtan" if values else "pinhole"
-        return camera_from_matrix(K, _WIDTH, _HEIGHT, kind, values[:_COEFFICIENTS], self._name)
+        return camera_from_matrix(
+            K, _STREAMS.width, _STREAMS.height, kind, values[:_COEFFICIENTS], self._name
+        )
 
     def events(self) -> Iterator[SourceEvent | None]:
         """Yield pairs and samples.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import queue
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,18 @@ from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
 
 log = logging.getLogger(__name__)
 
-_WIDTH = 640
-_HEIGHT = 480
-_RATE_HZ = 30
-_SILENT_S = 0.5
+
+@dataclass(frozen=True, slots=True)
+class _Streams:
+    """Which streams of the camera are read."""
+
+    width: int = 640
+    height: int = 480
+    rate_hz: int = 30
+    silent_s: float = 0.5
+
+
+_STREAMS = _Streams()
 _LOST_S = 5.0
 _WAITING = 1000  # frames and samples that may wait for the reader
 
@@ -116,7 +125,7 @@ class RealSenseSource:
                     video = profile.as_video_stream_profile()
                     form = (video.width(), video.height(), video.fps())
                     if profile.format() == rs.format.y8 and (
-                        self._is_file or form == (_WIDTH, _HEIGHT, _RATE_HZ)
+                        self._is_file or form == (_STREAMS.width, _STREAMS.height, _STREAMS.rate_hz)
                     ):
                         found[("left", "right")[index - 1]] = sensor, profile
                 elif kind in (rs.stream.gyro, rs.stream.accel):
@@ -212,9 +221,9 @@ class RealSenseSource:
         pairing: Pairing[Image] = Pairing()
         while True:
             try:
-                frame = self._come.get(timeout=_SILENT_S)
+                frame = self._come.get(timeout=_STREAMS.silent_s)
             except queue.Empty:
-                silent_s += _SILENT_S
+                silent_s += _STREAMS.silent_s
                 if (
                     self._is_file
                     and self._device.as_playback().current_status() == rs.playback_status.stopped

@@ -37,17 +37,27 @@ if TYPE_CHECKING:
 _LEFT = "world/run/camera"  # the left camera; below it, what is drawn into its image
 _MARKS = ("features", "tracks_by_age")
 _OUTLINE = f"{_LEFT}/outline"  # of what a camera sees whose image is not a pinhole's
-_SIDE = 25  # points of a side of it
-_OUTLINE_BASELINES = 5.0  # distance from the camera at which it is drawn
-# of the run's time that images, tracks and points may take; the rest is drawn in every frame
-_SHARE = 0.08
-_WIDEST_PX = 752  # images are shown at this width at most
-_JPEG_QUALITY = 75
-_CHUNK = 64  # poses of a path that are sent together; the last chunk is sent again with every pose
-_TAIL = 12  # positions of a track that are drawn
-_MIN_DISPARITY_PX = 3.0  # of points drawn from one stereo pair
-_SIGMAS = 3.0
-_OLD_FRAMES = 40  # age of a track whose colour is the last of the scale
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """What the pictures of the viewer show."""
+
+    side: int = 25  # points of a side of it
+    outline_baselines: float = 5.0  # distance from the camera at which it is drawn
+    # of the run's time that images, tracks and points may take; the rest is drawn in every frame
+    share: float = 0.08
+    widest_px: int = 752  # images are shown at this width at most
+    jpeg_quality: int = 75
+    # poses of a path that are sent together; the last chunk is sent again with every pose
+    chunk: int = 64
+    tail: int = 12  # positions of a track that are drawn
+    min_disparity_px: float = 3.0  # of points drawn from one stereo pair
+    sigmas: float = 3.0
+    old_frames: int = 40  # age of a track whose colour is the last of the scale
+
+
+_PICTURE = _Picture()
 _STATES = {
     "used": (31, 95, 191),
     "landmark": (46, 139, 87),
@@ -85,7 +95,7 @@ class RerunViewer:
         rig: ViewedRig,
         *,
         address: str | None = None,
-        share: float = _SHARE,
+        share: float = _PICTURE.share,
     ) -> None:
         """Draw what does not change.
 
@@ -105,7 +115,7 @@ class RerunViewer:
         self._path: list[FloatArray] = []  # positions of the present chunk
         self._chunks = 0
         # of the image that is shown
-        self._scale = min(_WIDEST_PX / (rig.camera.width or _WIDEST_PX), 1.0)
+        self._scale = min(_PICTURE.widest_px / (rig.camera.width or _PICTURE.widest_px), 1.0)
         self._tails: dict[int, list[FloatArray]] = {}
         self._ages: dict[int, int] = {}
         self._places: dict[int, FloatArray] = {}  # positions of the keyframes of a map, by frame
@@ -250,7 +260,9 @@ class RerunViewer:
         for name, series in SERIES.items():
             self._stream.log(f"plots/{name}", rr.SeriesLines(names=list(series)), static=True)
         if camera.is_cylinder:
-            strips = [_OUTLINE_BASELINES * camera.baseline_m * strip for strip in outline(camera)]
+            strips = [
+                _PICTURE.outline_baselines * camera.baseline_m * strip for strip in outline(camera)
+            ]
             self._stream.log(_OUTLINE, rr.LineStrips3D(strips, colors=_STATES["used"]), static=True)
             return
         scale = self._scale
@@ -288,13 +300,13 @@ class RerunViewer:
         self._path.append(T[:3, 3])
         path = rr.LineStrips3D([self._path], colors=_STATES["used"], radii=rr.Radius.ui_points(1.5))
         send(f"world/run/path/{self._chunks:05d}", path)
-        if len(self._path) >= _CHUNK:
+        if len(self._path) >= _PICTURE.chunk:
             self._path = self._path[-1:]
             self._chunks = self._chunks + 1
         values, axes = np.linalg.eigh(rotated(T[:3, :3], estimate.covariance[:3, :3]))
         axes[:, 2] *= np.sign(np.linalg.det(axes))
         send("world/run/sigma", rr.Transform3D(translation=T[:3, 3], mat3x3=axes))
-        sizes = _SIGMAS * np.sqrt(np.maximum(values, 0.0))
+        sizes = _PICTURE.sigmas * np.sqrt(np.maximum(values, 0.0))
         send(
             "world/run/sigma",
             rr.Ellipsoids3D(half_sizes=[sizes], centers=[[0, 0, 0]], colors=[_STATES["landmark"]]),
@@ -348,7 +360,7 @@ class RerunViewer:
         """Note where features were, for their tails and ages."""
         tails: dict[int, list[FloatArray]] = {}
         for name, pixel in zip(seen.ids.tolist(), seen.z[:, :2], strict=True):
-            tails[name] = [*self._tails.get(name, [])[1 - _TAIL :], pixel]
+            tails[name] = [*self._tails.get(name, [])[1 - _PICTURE.tail :], pixel]
         self._ages = {name: self._ages.get(name, -1) + 1 for name in tails}
         self._tails = tails
 
@@ -361,7 +373,7 @@ class RerunViewer:
             shown = cv2.resize(
                 image, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA
             )
-        good, data = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        good, data = cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, _PICTURE.jpeg_quality])
         if good:
             self._stream.log(
                 f"{_LEFT}/image", rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")
@@ -394,7 +406,7 @@ class RerunViewer:
 
         camera = self._rig.camera
         z = seen.z
-        near = seen.has_right & (z[:, 0] - z[:, 2] > _MIN_DISPARITY_PX)
+        near = seen.has_right & (z[:, 0] - z[:, 2] > _PICTURE.min_disparity_px)
         depth = camera.fu * camera.baseline_m / (z[near, 0] - z[near, 2])
         p_cam = left_rays(camera, z[near, :2]) * depth[:, None]
         T_world_cam0 = estimate.T_world_imu @ se3_inverse(self._rig.T_cam0_body)
@@ -418,7 +430,7 @@ def outline(camera: StereoCamera) -> list[FloatArray]:
     """
     width, height = _size(camera)
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
-    share = np.linspace(0, 1, _SIDE)[:, None]
+    share = np.linspace(0, 1, _PICTURE.side)[:, None]
     border = np.concatenate([a + share * (b - a) for a, b in pairwise(corners)])
     return [
         left_rays(camera, border),
@@ -442,7 +454,9 @@ def age_colours(ages: IntArray) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """Return colours (N, 3) of ages (N,) in frames, from yellow for new tracks to blue for old
     ones.
     """
-    share: FloatArray = np.clip(np.asarray(ages, dtype=np.float64) / _OLD_FRAMES, 0, 1)[:, None]
+    share: FloatArray = np.clip(np.asarray(ages, dtype=np.float64) / _PICTURE.old_frames, 0, 1)[
+        :, None
+    ]
     new = np.array([255.0, 214.0, 10.0])
     old = np.array([20.0, 60.0, 200.0])
     colours = np.round(new + share * (old - new))

@@ -1,0 +1,321 @@
+"""The checks of right matches by their columns: features of another program, and none of them
+images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tools.faults.changes import Period
+from tools.faults.columns import COLUMNS, ColumnChange, changed_features, during
+from vio.config import load_config
+from vio.errors import DataError
+from vio.findings import Finding
+from vio.frontend import build_frontend
+from vio.frontend.precomputed import PrecomputedFrontend, with_right_of
+from vio.frontend.settings import FrontendSettings
+from vio.geometry.lie import FloatArray, so3_exp
+from vio.geometry.stereo import StereoCamera
+from vio.guard.guarded import GuardedFrontend
+from vio.guard.lost_matches import LostMatches
+from vio.guard.match_check import Hysteresis, SharedMatches, shared_matches
+from vio.guard.matches import RightMatches
+from vio.records import Observations, Recording, StereoFrame, Trajectory, observations
+from vio.runs.pipeline import RunResult, run
+
+CAMERA = StereoCamera(fu=500.0, fv=500.0, cu=320.0, cv=240.0, baseline_m=0.3, width=640, height=480)
+FRAMES = 40
+STEP_NS = 100_000_000
+PERIOD = Period(15 * STEP_NS, 25 * STEP_NS)
+FAULT = range(15, 25)
+CODES = {
+    "right frozen": ["right-image-frozen", "-right-image-frozen"],
+    "exchanged": ["images-exchanged", "-images-exchanged"],
+    "right dark": ["right-matches-lost", "-right-matches-lost"],
+    "right late": ["pairs-shifted"],
+    "right rolled": ["right-contradicts-left"],
+}
+
+
+def poses(nod: float = 0.7) -> FloatArray:
+    """Poses (F, 4, 4) of a camera that goes ahead and nods, by `nod` rad of its period a frame."""
+    out = np.tile(np.eye(4), (FRAMES, 1, 1))
+    for k in range(FRAMES):
+        out[k, :3, :3] = so3_exp(np.array([0.02 * np.sin(nod * k), 0.01 * np.sin(0.3 * k), 0.0]))
+        out[k, :3, 3] = [0.02 * k, 0.1 * np.sin(0.5 * k), 0.3 * k]
+    return out
+
+
+def flight(noise_px: float = 0.2, visible: float = 1.0, nod: float = 0.7) -> list[Observations]:
+    """What a rig sees of points ahead; a share of them has right pixels."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-15.0, -8.0, 3.0], [15.0, 8.0, 45.0], (900, 3))
+    has_right = rng.random(len(points)) < visible
+    frames = []
+    for k, T in enumerate(poses(nod)):
+        p = (points - T[:3, 3]) @ T[:3, :3]
+        depth = np.maximum(p[:, 2], 0.1)
+        left = p[:, :2] / depth[:, None] * 500.0 + [320.0, 240.0]
+        right = left - np.column_stack([150.0 / depth, np.zeros(len(p))])
+        z = np.hstack([left, right]) + rng.normal(0.0, noise_px, (len(p), 4))
+        inside = (z > 0).all(axis=1) & (z < [640, 480, 640, 480]).all(axis=1) & (p[:, 2] > 2)
+        ids = np.flatnonzero(inside)
+        frames.append(observations(k, k * STEP_NS, ids, z[ids], has_right[ids]))
+    return frames
+
+
+def changed(change: ColumnChange, seen: Sequence[Observations]) -> list[Observations]:
+    return [change(seen, k, CAMERA, PERIOD) for k in range(len(seen))]
+
+
+def inspected(seen: Sequence[Observations]) -> tuple[list[Observations], list[Finding]]:
+    checks = RightMatches(CAMERA)
+    out = [checks.inspect(o) for o in seen]
+    return out, list(checks.take_findings())
+
+
+def codes(findings: Sequence[Finding]) -> list[str]:
+    return [f"-{f.code}" if f.ended else f.code for f in findings]
+
+
+def test_healthy_matches_are_handed_on_as_they_are() -> None:
+    seen = flight()
+    out, findings = inspected(seen)
+    assert codes(findings) == []
+    assert all(a is b for a, b in zip(out, seen, strict=True))
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_every_fault_of_the_columns_is_named_once(name: str) -> None:
+    assert codes(inspected(changed(COLUMNS[name], flight()))[1]) == CODES[name]
+
+
+@pytest.mark.parametrize("name", ["right frozen", "right rolled"])
+def test_no_right_pixel_of_a_fault_is_output(name: str) -> None:
+    out, _ = inspected(changed(COLUMNS[name], flight()))
+    assert not any(out[k].has_right.any() for k in FAULT)
+    assert all(out[k].has_right.all() for k in range(FAULT.start))
+
+
+def test_exchanged_pixels_are_put_back_to_the_bit() -> None:
+    seen = flight(visible=0.8)
+    out, _ = inspected(changed(COLUMNS["exchanged"], seen))
+    for k in FAULT:
+        np.testing.assert_array_equal(out[k].z, seen[k].z[seen[k].has_right])
+
+
+def test_a_recording_that_begins_exchanged_is_refused() -> None:
+    exchanged = [replace(o, z=o.z[:, [2, 3, 0, 1]]) for o in flight()]
+    with pytest.raises(DataError, match="frame 2: left and right pixels look exchanged"):
+        inspected(exchanged)
+
+
+@pytest.mark.parametrize(("share", "named"), [(0.5, False), (0.7, True)])
+def test_most_disparities_must_be_negative(share: float, named: bool) -> None:
+    def some(
+        seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
+    ) -> Observations:
+        rows = np.arange(len(seen[k])) < share * len(seen[k])
+        return replace(seen[k], z=np.where(rows[:, None], seen[k].z[:, [2, 3, 0, 1]], seen[k].z))
+
+    found = codes(inspected(changed(during(some), flight()))[1])
+    assert ("images-exchanged" in found) == named
+
+
+@pytest.mark.parametrize(("rows_px", "named"), [(0.4, False), (1.2, True)])
+def test_rows_must_jump_clearly(rows_px: float, named: bool) -> None:
+    def pitched(
+        seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
+    ) -> Observations:
+        return replace(seen[k], z=seen[k].z + np.array([0.0, 0.0, 0.0, rows_px]))
+
+    found = codes(inspected(changed(during(pitched), flight(noise_px=0.05)))[1])
+    assert found == (["right-contradicts-left", "-right-contradicts-left"] if named else [])
+
+
+def test_rows_that_are_off_from_the_start_are_a_matter_of_the_calibration() -> None:
+    pitched = [replace(o, z=o.z + np.array([0.0, 0.0, 0.0, 5.0])) for o in flight()]
+    assert codes(inspected(pitched)[1]) == []
+
+
+def test_noisy_rows_are_usual() -> None:
+    assert codes(inspected(flight(noise_px=1.0))[1]) == []
+
+
+@pytest.mark.parametrize(
+    ("left_px", "share", "frozen"),
+    [
+        (10.0, 0.05, True),
+        (10.0, 0.2, False),
+        (1.5, 0.0, False),
+    ],
+)
+def test_right_pixels_must_stay_while_left_ones_move(
+    left_px: float, share: float, frozen: bool
+) -> None:
+    z = np.tile([300.0, 200.0, 280.0, 200.0], (30, 1))
+    seen = []
+    for k in range(6):
+        moved = k * left_px * np.array([1.0, 0.0, share, 0.0])
+        seen.append(observations(k, k * STEP_NS, np.arange(30), z + moved))
+    assert ("right-image-frozen" in codes(inspected(seen)[1])) == frozen
+
+
+@pytest.mark.parametrize(("share", "lost"), [(0.1, True), (0.25, False)])
+def test_hardly_any_match_must_be_left(share: float, lost: bool) -> None:
+    check = LostMatches()
+    nothing = shared_matches(None, flight()[0])
+    for k in range(20):
+        has_right = np.arange(100) < 100 * (share if k >= 10 else 1.0)
+        seen = observations(k, k, np.arange(100), np.zeros((100, 4)), has_right)
+        assert check.inspect(seen, nothing) is seen
+    assert codes(check.take_findings()) == (["right-matches-lost"] if lost else [])
+
+
+def test_few_right_matches_may_be_usual() -> None:
+    assert codes(inspected(flight(visible=0.2))[1]) == []
+
+
+def test_a_delay_that_is_no_whole_frame_is_taken_out() -> None:
+    """The right pixels are those of 0.4 frames before; then the rows agree again."""
+    seen = flight(noise_px=0.05, nod=0.3)
+    late = []
+    for k, now in enumerate(seen):
+        before = with_right_of(now, seen[max(k - 1, 0)])
+        z = now.z.copy()
+        z[:, 2:] = 0.6 * now.z[:, 2:] + 0.4 * before.z[:, 2:]
+        late.append(replace(now, z=z, has_right=before.has_right))
+    out, findings = inspected(late)
+    assert codes(findings) == ["right-image-late"]
+    assert findings[0].figures["delay_frames"] == pytest.approx(0.4, abs=0.05)
+    used = [k for k in range(30, FRAMES) if out[k].has_right.any()]
+    assert used
+
+    def error(k: int, record: Observations) -> float:
+        rows = record.has_right
+        return float(np.median(np.abs(record.z - seen[k].z)[rows, 2:]))
+
+    assert all(error(k, out[k]) < 0.5 * error(k, late[k]) for k in used)
+
+
+# The paths that call the checks
+
+
+def fed(frontend: GuardedFrontend, seen: Sequence[Observations]) -> list[Finding]:
+    frames = [StereoFrame(o.frame_index, o.time_ns, None, None) for o in seen]
+    return [f for frame in frames for f in frontend.process(frame).findings]
+
+
+@pytest.mark.parametrize("checked", [False, True])
+def test_what_a_run_of_ours_has_checked_is_not_checked_again(checked: bool) -> None:
+    seen = changed(COLUMNS["right frozen"], flight())
+    source = PrecomputedFrontend(lambda index: seen[index], checks_matches=checked)
+    found = codes(fed(GuardedFrontend(source, CAMERA), seen))
+    assert found == ([] if checked else CODES["right frozen"])
+
+
+def test_one_camera_has_no_right_matches() -> None:
+    seen = flight(visible=0.0)
+    source = PrecomputedFrontend(lambda index: seen[index])
+    assert fed(GuardedFrontend(source, replace(CAMERA, kind="mono")), seen) == []
+
+
+@pytest.mark.parametrize("delay", [-1, 1])
+def test_late_right_pixels_are_paired_anew_by_the_ids(delay: int) -> None:
+    seen = flight()
+    late = [
+        with_right_of(seen[k], seen[k - delay]) for k in range(FRAMES) if 0 <= k - delay < FRAMES
+    ]
+    frontend = PrecomputedFrontend(lambda index: late[index] if index < len(late) else None)
+    frontend.right_delay = delay
+    out = frontend.process(StereoFrame(5, 5 * STEP_NS, None, None)).observations
+    # left and right of one frame, of which the number is that of the earlier one or its own
+    true = seen[late[5].frame_index + (delay < 0)]
+    out = out.take(out.has_right)
+    _, rows, others = np.intersect1d(out.ids, true.ids, return_indices=True)
+    assert len(rows) == len(out) > 50
+    np.testing.assert_array_equal(out.z[rows], true.z[others])
+
+
+def recording() -> Recording:
+    times_ns = np.arange(FRAMES) * STEP_NS
+    reference = Trajectory(poses(), times_ns, "cam0")
+    return Recording("log", Path("made"), CAMERA, None, times_ns, False, frozenset(), reference)
+
+
+def run_with(change: ColumnChange) -> RunResult:
+    features = changed_features(recording(), flight(), change, PERIOD)
+    return run(features, load_config(overrides=["motion=none"]))
+
+
+def path_error_m(result: RunResult) -> float:
+    T = result.trajectory.T_world_body
+    truth = poses()[result.trajectory.frame_indices]
+    first = T[0, :3, :3].T @ (T[-1, :3, 3] - T[0, :3, 3])
+    true = truth[0, :3, :3].T @ (truth[-1, :3, 3] - truth[0, :3, 3])
+    return float(np.linalg.norm(first - true))
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_a_run_of_features_names_each_fault_and_keeps_its_path(name: str) -> None:
+    result = run_with(COLUMNS[name])
+    named = "pairs-put-right" if name == "right late" else CODES[name][0]
+    assert named in [finding.code for finding in result.findings]
+    assert path_error_m(result) < 0.15  # of 12 m
+
+
+def test_the_replaying_front_end_knows_who_checked_its_features() -> None:
+    features = changed_features(recording(), flight(), lambda seen, k, *_: seen[k], PERIOD)
+    settings = FrontendSettings()
+    other = build_frontend("precomputed", CAMERA, settings, features)
+    ours = replace(features, recording=replace(features.recording, run_motion="none"))
+    assert isinstance(other, PrecomputedFrontend)
+    assert not other.checks_matches
+    again = build_frontend("precomputed", CAMERA, settings, ours)
+    assert isinstance(again, PrecomputedFrontend)
+    assert again.checks_matches
+
+
+# The state with hysteresis
+
+
+def test_a_state_is_reported_after_some_frames_and_ends_after_others() -> None:
+    state = Hysteresis(to_report=2, to_end=2, blind=3)
+    said = []
+    for k, sign in enumerate([True, None, True, False, True, False, False, False]):
+        state.show(k, sign)
+        if state.to_report:
+            state.reported = True
+            said.append(f"begins {k} since {state.since}")
+        if state.ends():
+            said.append(f"ends {k}")
+    assert said == ["begins 2 since 0", "ends 6"]
+
+
+def test_a_state_without_a_sign_for_long_is_given_up() -> None:
+    state = Hysteresis(to_report=1, to_end=1, blind=3)
+    state.show(0, True)
+    state.reported = True
+    ends = []
+    for k in range(1, 4):
+        state.show(k, None)
+        ends.append(state.ends())
+    assert ends == [False, False, True]
+    assert state.since is None
+
+
+def test_shared_matches_are_those_of_both_frames() -> None:
+    z = np.arange(12.0).reshape(3, 4)
+    before = observations(0, 0, [1, 2, 3], z, [True, True, False])
+    now = observations(1, STEP_NS, [4, 2, 1], z, [True, True, False])
+    shared = shared_matches(before, now)
+    assert isinstance(shared, SharedMatches)
+    assert shared.had_right == 2
+    assert shared.rows.tolist() == [1]
+    np.testing.assert_array_equal(shared.before, z[[1]])
+    assert shared.seconds == pytest.approx(0.1)

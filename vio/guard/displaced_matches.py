@@ -1,0 +1,111 @@
+"""A right camera that turns in its mount: its rows jump, all at once and for good.
+
+Rows of left and right pixels differ by a smooth field that a wrong calibration makes, which is
+learned here from all matches. Where the matches of a frame are off that field by far more than
+usual, the right camera is not where it was, and its pixels are not used until they fit again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.findings import Finding
+from vio.frontend.weighted_fit import add_equations
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.guard.match_check import Hysteresis, MatchCheck, SharedMatches, without_right
+from vio.numerics.compiled import solve_positive
+from vio.records import Observations
+
+
+@dataclass(frozen=True, slots=True)
+class _RowRules:
+    """When the rows of right pixels contradict those so far."""
+
+    min_matches: int = 20  # in a frame that tells
+    min_frames: int = 5  # that the field was learned from
+    memory: float = 0.97  # per frame, of the normal equations
+    row_sigma_px: float = 0.5  # of the rows, beyond which a match counts less (Cauchy)
+    # median distance from the field that contradicts it: that of rows that are random within 1.5 px, in
+    # which descriptors are matched …
+    min_rows_px: float = 0.75
+    clearly: float = 5.0  # … and times the usual one
+    agrees: float = 0.5  # of the distance that contradicts, below which the rows fit again
+    usual_gain: float = 0.2  # how fast the usual distance is learned
+
+
+_RULES = _RowRules()
+_TERMS = 6
+_CODE = "right-contradicts-left"
+
+
+class DisplacedMatches(MatchCheck):
+    """Removes right pixels whose rows contradict those so far."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        super().__init__()
+        self._camera = camera
+        self._normal: FloatArray = np.zeros((_TERMS, _TERMS))
+        self._moment: FloatArray = np.zeros(_TERMS)
+        self._field: FloatArray = np.zeros(_TERMS)
+        self._frames = 0
+        self._usual_px = 0.0
+        self._state = Hysteresis(to_report=3, to_end=3, blind=40)
+
+    def inspect(self, seen: Observations, shared: SharedMatches) -> Observations:
+        """Compare the rows of left and right pixels with the field."""
+        index = seen.frame_index
+        state = self._state
+        z = seen.z[seen.has_right]
+        if len(z) < _RULES.min_matches:
+            state.show(index, None)
+            return seen if state.since is None else without_right(seen)
+        terms = self._terms(z)
+        rows = z[:, 3] - z[:, 1]
+        off_px = float(np.median(np.abs(rows - terms @ self._field)))
+        limit_px = max(_RULES.min_rows_px, _RULES.clearly * self._usual_px)
+        sign = self._sign(off_px, limit_px)
+        state.show(index, sign)
+        if not sign and state.since is None:
+            self._learn(terms, rows, off_px)
+        if state.to_report:
+            state.reported = True
+            message = (
+                f"frame {index}: the right pixels contradict the left ones since frame "
+                f"{state.since}: their rows are off by {off_px:.1f} px more than before; the right "
+                "camera has turned in its mount, or the pairs have become others; going on with "
+                "the left pixels"
+            )
+            self._found.append(
+                Finding(_CODE, message, index, state.since, lasts=True, figures={"rows_px": off_px})
+            )
+        if state.ends():
+            message = f"frame {index}: the right pixels agree with the left ones again"
+            self._found.append(Finding(_CODE, message, index, ended=True))
+        return seen if state.since is None else without_right(seen)
+
+    def _sign(self, off_px: float, limit_px: float) -> bool | None:
+        if self._frames < _RULES.min_frames:
+            return None
+        if off_px > limit_px:
+            return True
+        return False if off_px <= _RULES.agrees * limit_px else None
+
+    def _terms(self, z: FloatArray) -> FloatArray:
+        """The terms (N, 6) of the field at left pixels of `z` (N, 4)."""
+        x = (z[:, 0] - self._camera.cu) / self._camera.fu
+        y = (z[:, 1] - self._camera.cv) / self._camera.fv
+        return np.array([np.ones(len(x)), x, y, x * y, x * x, y * y]).T.copy()
+
+    def _learn(self, terms: FloatArray, rows: FloatArray, off_px: float) -> None:
+        self._normal *= _RULES.memory
+        self._moment *= _RULES.memory
+        sigma = _RULES.row_sigma_px if self._frames else np.inf
+        add_equations(terms, rows, self._field, sigma, self._normal, self._moment)
+        self._field = self._moment.copy()
+        solve_positive(self._normal + 1e-6 * np.eye(_TERMS), self._field)
+        if self._frames:
+            self._usual_px += _RULES.usual_gain * (off_px - self._usual_px)
+        self._frames += 1
