@@ -11,13 +11,13 @@ Reference: Baker & Matthews, Lucas-Kanade 20 years on, IJCV (2004).
 
 from __future__ import annotations
 
-from vio.dataclass import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.frontend.patches import Patches
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled, compiled_sums, invert_positive

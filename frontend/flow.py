@@ -4,11 +4,10 @@ full image.
 
 from __future__ import annotations
 
-from vio.dataclass import dataclass
-
 import cv2
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.frontend.patches import ImageLevels, inside, mean_and_contrast
 from vio.frontend.tracks import ANCHOR_REACH_PX
 from vio.geometry.lie import FloatArray

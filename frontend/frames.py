@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from dataclasses import field
-from vio.dataclass import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray

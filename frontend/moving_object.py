@@ -23,11 +23,11 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from vio.dataclass import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.findings import Finder, Finding
 from vio.frontend.columns import share_of
 from vio.frontend.outliers import (

@@ -16,13 +16,13 @@ for the case of pure rotation.
 
 from __future__ import annotations
 
-from vio.dataclass import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args, moved_pixel, point_at, turn_to
+from vio.dataclass import dataclass
 from vio.frontend.columns import share_of
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, project

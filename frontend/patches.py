@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from vio.dataclass import dataclass
 from typing import TypeAlias
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.dataclass import dataclass
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image
 

@@ -72,9 +72,7 @@ def with_right_of(seen: Observations, other: Observations) -> Observations:
 
     Those that it does not show have none.
     """
-    _, rows, others = np.intersect1d(
-        seen.ids, other.ids, assume_unique=True, return_indices=True
-    )
+    _, rows, others = np.intersect1d(seen.ids, other.ids, assume_unique=True, return_indices=True)
     z = seen.z.copy()
     z[rows, 2:] = other.z[others, 2:]
     has_right = np.zeros(len(seen), dtype=np.bool_)

@@ -11,10 +11,10 @@ followed, and no new ones are found.
 from __future__ import annotations
 
 from dataclasses import replace
-from vio.dataclass import dataclass
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.frontend.align import align, on_peak
 from vio.frontend.columns import take
 from vio.frontend.flow import track_with_retries

@@ -13,10 +13,10 @@ takes the place of the one that came with it: they were paired wrongly.
 from __future__ import annotations
 
 from dataclasses import replace
-from vio.dataclass import dataclass
 
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.findings import Finder, Finding
 from vio.frontend.tracks import Tracks
 from vio.frontend.weighted_fit import add_equations

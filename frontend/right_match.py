@@ -4,10 +4,9 @@ late, or another one.
 
 from __future__ import annotations
 
-from vio.dataclass import dataclass
-
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.frontend.one_camera import with_prior_depths
 from vio.frontend.outliers import Consensus
 from vio.frontend.patches import ImageLevels

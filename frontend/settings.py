@@ -6,10 +6,10 @@ Lengths that scale with the image size are given as fractions of it.
 from __future__ import annotations
 
 from dataclasses import field
-from vio.dataclass import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from vio.dataclass import dataclass
 from vio.setting import Section, setting
 
 

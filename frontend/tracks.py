@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from vio.dataclass import dataclass
-
 import numpy as np
 
+from vio.dataclass import dataclass
 from vio.frontend.align import INSIDE, cut_patches, empty_templates, replace_templates, shift_warps
 from vio.frontend.columns import joined
 from vio.frontend.patches import ImageLevels

@@ -124,7 +124,7 @@ class ImuSampleCheck:
         clipped = self._ranges.take(readings)
         if clipped.any():
             self._faults += self._ranges.faults(samples, clipped)
-            left_out: BoolArray = clipped.any(axis=1)
+            left_out = np.any(clipped, axis=1)
             samples = [x for x, out in zip(samples, left_out.tolist(), strict=True) if not out]
             readings = readings[~left_out]
         times = np.array([x.time_ns for x in samples], dtype=np.int64)

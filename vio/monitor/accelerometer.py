@@ -74,10 +74,10 @@ def resolve_size(size: Size, evidence: Evidence) -> Size:
 
 
 def judge_force(
-    evidence: Evidence, unit: float, camera: StereoCamera
+    evidence: Evidence, unit: float, camera: StereoCamera | None
 ) -> tuple[list[InertialFinding], bool]:
     """Judge axes and sign of the accelerometer, whose readings times `unit` are m/s^2, and the
-    scale of the camera's motion; and if the sign is known.
+    scale of a pair's motion, if one is given; and if the sign is known.
     """
     gyro_fit = evidence.gyro_fit
     force = evidence.force
@@ -87,7 +87,9 @@ def judge_force(
         wrong = _wrong_axes(evidence.early_force, R * unit)
         if wrong is not None:
             return [wrong], True
-        scaled = _wrong_scale(evidence.early_force, R * unit, camera)
+        scaled = None
+        if camera is not None:
+            scaled = _wrong_scale(evidence.early_force, R * unit, camera)
         if scaled is not None:
             return [scaled], True
     if force is not None:

@@ -111,7 +111,7 @@ def _judge(record: Record, gyro_fit: GyroFit, size: Size) -> list[InertialFindin
     axes_agree = gyro_fit.axes == 3 and all(f.fault == "gyro units" for f in found)
     if not axes_agree or size.unit is None:
         return found
-    return found + [_of_both_sensors(f) for f in judge_force(evidence, size.unit)[0]]
+    return found + [_of_both_sensors(f) for f in judge_force(evidence, size.unit, None)[0]]
 
 
 def _disagreement(gyro_fit: GyroFit) -> InertialFinding:
