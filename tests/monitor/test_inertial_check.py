@@ -408,7 +408,7 @@ def test_a_baseline_in_squares_of_a_board_is_named_with_its_length(
     for frames in (wrong.frames, wrong.frames[:95]):
         (found,) = _watch(wrong, frames=frames)
         assert found.fault == "camera scale"
-        assert not found.certain
+        assert (found.code, found.certain) == ("scale-off", True)
         words = found.explanation.split("would be ")[1]
         assert float(words.split(" m")[0]) == pytest.approx(true_m, rel=0.15)
 

@@ -103,6 +103,17 @@ def test_frames_before_a_fault_was_found_are_marked() -> None:
     assert late.covariance[1, 1] == pytest.approx(9.0, rel=1e-3)
 
 
+def test_what_the_end_of_a_run_shows_of_all_frames_marks_them() -> None:
+    """A scale that is off is off from the start, however late it was found."""
+    monitor = IntegrityMonitor()
+    for k in range(5):
+        monitor.judged(k, estimate(k))
+    monitor.take(Finding("scale-off", "40 times too long", 4, since=0, lasts=True))
+    monitor.take(Finding("imu-clock", "apart", 4))
+    monitor.close(4)
+    assert monitor.take_marks() == (Mark(0, 5, "degraded", "scale-off"),)
+
+
 def test_unknown_codes_are_refused() -> None:
     with pytest.raises(ConfigError, match="no finding 'something'"):
         Finding("something", "")

@@ -74,7 +74,7 @@ _CODES: dict[InertialFault, str] = {
     "IMU gap": "imu-gap",
     "camera stamps": "imu-clock",
     "camera turns": "imu-disagrees",
-    "camera scale": "imu-disagrees",
+    "camera scale": "scale-off",
 }
 
 

@@ -137,7 +137,7 @@ def _wrong_scale(force: ForceFit, C: FloatArray, camera: StereoCamera) -> Inerti
             "give the translation between the cameras in metres"
         )
     return InertialFinding(
-        "camera scale", seen, f"{remedy}; all lengths of the run are too long by it", certain=False
+        "camera scale", seen, f"{remedy}; all lengths of the run are too long by it"
     )
 
 

@@ -17,10 +17,11 @@ from vio.findings import Finding
 from vio.numerics.robust import median
 
 _CONTRADICTED = 4.0  # median innovation over its standard deviation
-_FRAMES = 8  # the newest, of which …
-# … so many are contradicted; four are where a healthy one is at its worst, a flight whose images are
-# rendered along poses of a motion capture, which its real IMU contradicts now and then
-_MIN_CONTRADICTED = 6
+_FRAMES = 24  # the newest, of which …
+# … so many are contradicted. Healthy ones come to 13 of 24 where a flight begins with vibrations
+# that the stated noise lacks and the filter learns (images rendered along MH_03, its real IMU:
+# 7 of the first 8, ATE 0.3 mm); clocks 0.1 s off and an IMU turned by 18 degrees to 21 and more.
+_MIN_CONTRADICTED = 20
 _QUIET_FRAMES = 20  # in a row without one, after which IMU and images agree again
 _CODE = "imu-disagrees"
 

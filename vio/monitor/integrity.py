@@ -70,6 +70,14 @@ class IntegrityMonitor:
         self._marks = []
         return marks
 
+    def close(self, index: int) -> None:
+        """Mark the frames up to the last one that findings at the end of the run hold for."""
+        for finding in self._new:
+            since = finding.first_frame
+            if finding.effect != "nominal" and since is not None and since < index:
+                self._marks.append(Mark(since, index + 1, finding.effect, finding.code))
+        self._new = []
+
     def judged(self, index: int, estimate: Estimate) -> Estimate:
         """Return the estimate of a frame with its integrity and, where it is not nominal, the codes
         of what holds.

@@ -338,6 +338,7 @@ class RunMonitor:
             )
             line = f"one camera: {self.frames_waiting} frames have no pose; {why}"
             self._report("no-pose", [line])
+        self._integrity.close(self._index)
 
     def _report_findings(self, findings: Iterable[InertialFinding]) -> None:
         """Log findings; gaps are reported one by one by `ImuSilence`."""
@@ -352,8 +353,16 @@ class RunMonitor:
                 self._add([self._of_imu(finding)])
 
     def _of_imu(self, finding: InertialFinding) -> Finding:
-        """Return a finding of the IMU as one of the run."""
-        return Finding(finding.code, finding.message, self._index, certain=finding.certain)
+        """Return a finding of the IMU as one of the run; a scale is that of all frames."""
+        since = 0 if finding.code == "scale-off" else None
+        return Finding(
+            finding.code,
+            finding.message,
+            self._index,
+            since,
+            lasts=since is not None,
+            certain=finding.certain,
+        )
 
     def _report(self, code: str, lines: Iterable[str]) -> None:
         """Report events of one kind, one line each."""
