@@ -105,7 +105,7 @@ BAD = {
     "empty images": (_kitti(_images(lambda _: b"")), "the file is empty"),
     "images that are text": (_kitti(_images(lambda _: b"hello " * 99)), "neither PNG nor JPEG"),
     "times that are no text": (
-        _kitti(lambda f: (f / "times.txt").write_bytes(b"\xff\xfe0\n")),
+        _kitti(lambda f: (f / "times.txt").write_bytes(b"\xc3\x280\n")),
         r"times\.txt.*(not a text|no text|UTF-8|decode)",
     ),
 }
