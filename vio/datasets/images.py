@@ -132,7 +132,11 @@ def exif_turn(path: Path) -> int:
     does not ask.
 
     Reference: Exif 2.3, tag 0x0112, in the segment APP1. Mirrored orientations count as their turn.
+
+    Raises:
+        OSError: it cannot be read, or is no regular file.
     """
+    check_regular(path)
     with path.open("rb") as stream:
         data = stream.read(_EXIF_BYTES)
     at = data.find(b"Exif\0\0")
