@@ -114,6 +114,22 @@ def test_what_the_end_of_a_run_shows_of_all_frames_marks_them() -> None:
     assert monitor.take_marks() == (Mark(0, 5, "degraded", "scale-off"),)
 
 
+def test_a_new_state_ends_what_was_found_of_the_old_one_and_nothing_else() -> None:
+    """A scale that is off since the first frame is the rig's; one that the lost state showed since
+    the last good estimate is not.
+    """
+    monitor = IntegrityMonitor()
+    judge(monitor, range(5))
+    monitor.take(Finding("scale-off", "of the rig", 5, since=0, lasts=True))
+    monitor.take(Finding("estimate-implausible", "", 5, lasts=True))
+    assert judge(monitor, range(5, 6))[0].integrity == "unusable"
+    monitor.end_since(estimate(4).time_ns, "estimate-implausible", "scale-off")
+    (after,) = judge(monitor, range(6, 7))
+    assert (after.integrity, after.findings) == ("degraded", ("scale-off",))
+    monitor.end_since(estimate(0).time_ns - 1, "scale-off")
+    assert judge(monitor, range(7, 8))[0].integrity == "nominal"
+
+
 def test_unknown_codes_are_refused() -> None:
     with pytest.raises(ConfigError, match="no finding 'something'"):
         Finding("something", "")

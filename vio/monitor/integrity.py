@@ -58,11 +58,14 @@ class IntegrityMonitor:
         """Take a finding; it counts from the next estimate on."""
         self._new.append(finding)
 
-    def end(self, *codes: str) -> None:
-        """Let go of findings on a state that has been replaced."""
+    def end_since(self, good_ns: int, *codes: str) -> None:
+        """Let go of findings on a state that has been replaced: those that hold from a frame on
+        after the last good estimate; what holds for earlier ones is not the state's.
+        """
         for code in codes:
-            self._holding.pop(code, None)
-        self._new = [finding for finding in self._new if finding.code not in codes]
+            entry = self._holding.get(code)
+            if entry is not None and self._onset_ns(entry.finding, good_ns + 1) > good_ns:
+                del self._holding[code]
 
     def take_marks(self) -> tuple[Mark, ...]:
         """Return the marks of earlier frames since the last call."""

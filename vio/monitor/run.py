@@ -282,7 +282,7 @@ class RunMonitor:
         is the time of the last estimate that could be used.
         """
         self._scale_lines = []
-        self._integrity.end("estimate-implausible", "scale-off")
+        self._integrity.end_since(good_ns, "estimate-implausible", "scale-off")
         self._add([self._health.begun_anew(index, good_ns, estimate)])
 
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
