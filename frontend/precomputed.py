@@ -11,7 +11,14 @@ from dataclasses import replace
 import numpy as np
 
 from vio.errors import DataError
-from vio.records import FrontendOutput, IntArray, Observations, StereoFrame, TrackPrior
+from vio.records import (
+    FrontendOutput,
+    IntArray,
+    Observations,
+    StereoFrame,
+    TrackPrior,
+    shared_rows,
+)
 
 
 class PrecomputedFrontend:
@@ -72,7 +79,7 @@ def with_right_of(seen: Observations, other: Observations) -> Observations:
 
     Those that it does not show have none.
     """
-    _, rows, others = np.intersect1d(seen.ids, other.ids, assume_unique=True, return_indices=True)
+    rows, others = shared_rows(seen.ids, other.ids)
     z = seen.z.copy()
     z[rows, 2:] = other.z[others, 2:]
     has_right = np.zeros(len(seen), dtype=np.bool_)

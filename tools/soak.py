@@ -64,17 +64,17 @@ class Player:
 
     def __init__(self, dataset: Dataset, rng: np.random.Generator) -> None:
         """Read the recording into memory."""
-        self._events: list[Event] = [
-            event for event in dataset.events() if isinstance(event, (StereoFrame, ImuSample))
-        ]
         reference = dataset.recording.reference
         assert reference is not None
         assert reference.times_ns is not None
         frames_ns = dataset.recording.frame_times_ns
         self._first_ns = int(frames_ns[0])
         self._period_ns = int(frames_ns[-1] - frames_ns[0] + np.median(np.diff(frames_ns)))
-        self._events = [
-            event for event in self._events if 0 <= event.time_ns - self._first_ns < self._period_ns
+        self._events: list[Event] = [
+            event
+            for event in dataset.events()
+            if isinstance(event, (StereoFrame, ImuSample))
+            and 0 <= event.time_ns - self._first_ns < self._period_ns
         ]
         self._truth = reference
         self._rng = rng

@@ -217,6 +217,14 @@ class Observations:
         return Observations(self.frame_index, self.time_ns, ids, z, has_right, stale, sigma)
 
 
+def shared_rows(ids: IntArray, other: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the rows (K,) of the features that two frames share, in the one and in the other, in
+    the order of their ids; the ids (N,) and (M,) of a frame are unique.
+    """
+    _, rows, others = np.intersect1d(ids, other, assume_unique=True, return_indices=True)
+    return rows, others
+
+
 def observations(
     frame_index: int,
     time_ns: int,

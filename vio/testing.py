@@ -23,7 +23,7 @@ from vio.errors import DataError
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray
 from vio.protocols import Detector, Frontend
-from vio.records import FrontendOutput, Observations, StereoFrame
+from vio.records import FrontendOutput, Observations, StereoFrame, shared_rows
 from vio.sim.render import View, correspondence, inside_image
 from vio.sim.scenarios import Scenario, conditions_of, plan
 from vio.sim.sequence import SimulatedRecording, Simulation, views
@@ -159,7 +159,7 @@ def compare(
     true, visible = correspondence(
         simulation.world, _views(simulation, before)[0], left, before.z[:, :2]
     )
-    _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    i, j = shared_rows(before.ids, now.ids)
     error = now.z[j, :2] - true[i]
     expected = visible & inside_image(left.camera, true, margin_px=_MARGIN_PX)
     errors.step.append(error[visible[i]])

@@ -289,8 +289,7 @@ def test_a_state_is_reported_after_some_frames_and_ends_after_others() -> None:
     said = []
     for k, sign in enumerate([True, None, True, False, True, False, False, False]):
         state.show(k, sign)
-        if state.to_report:
-            state.reported = True
+        if state.to_report():
             said.append(f"begins {k} since {state.since}")
         if state.ends():
             said.append(f"ends {k}")
@@ -300,7 +299,7 @@ def test_a_state_is_reported_after_some_frames_and_ends_after_others() -> None:
 def test_a_state_without_a_sign_for_long_is_given_up() -> None:
     state = Hysteresis(to_report=1, to_end=1, blind=3)
     state.show(0, True)
-    state.reported = True
+    assert state.to_report()
     ends = []
     for k in range(1, 4):
         state.show(k, None)

@@ -139,9 +139,9 @@ def side_by_side(path: Path, calibration: Path | None = None) -> Layout | None:
     return layout if (rig.cam0.width, rig.cam0.height) == half else None
 
 
-def pair_in_one_folder(path: Path) -> tuple[Layout, FilePairs] | None:
+def _pair_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
     """Return where the images of both cameras lie in one folder, by names that tell them apart, and
-    their pairs; None: there are none.
+    the images; None: there are none.
     """
     layout = _layout_of_one(path)
     if layout is None and _holds_images(path):
@@ -153,7 +153,9 @@ def pair_in_one_folder(path: Path) -> tuple[Layout, FilePairs] | None:
     if sides is None:
         return None
     pairs = FilePairs(*(ImageFiles(files.folder, tuple(names)) for names in sides))
-    return layout, pairs
+    alone = len(files) - 2 * len(pairs)
+    lone = (f"{alone} images have no partner and are skipped",) if alone else ()
+    return layout, _Images(pairs, lone)
 
 
 def _named_layout(path: Path, folders: str) -> Layout:
@@ -287,11 +289,8 @@ def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
         CalibrationError: there is no calibration, or it is invalid.
     """
     layout = pair_layout(path, settings.folders)
-    if layout is None and (found := pair_in_one_folder(path)) is not None:
-        layout, together = found
-        alone = len(list_images(layout.left)) - 2 * len(together)
-        lone = (f"{alone} images have no partner and are skipped",) if alone else ()
-        return _read("plain", layout, _Images(together, lone), settings)
+    if layout is None and (found := _pair_in_one_folder(path)) is not None:
+        return _read("plain", *found, settings)
     if layout is None and (layout := side_by_side(path, settings.calibration)) is not None:
         files = list_images(layout.left)
         images = _Images(FilePairs(files, files), side_by_side=True)
@@ -560,7 +559,7 @@ def _frame_numbers(pairs: ImagePairs) -> IntArray:
 
 
 def _is_both_in_one(path: Path) -> bool:
-    return pair_in_one_folder(path) is not None or side_by_side(path) is not None
+    return _pair_in_one_folder(path) is not None or side_by_side(path) is not None
 
 
 def _is_mono_of_euroc(path: Path) -> bool:

@@ -71,7 +71,6 @@ def split_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
     camera (`frame01_cam0`); those of one side without the other are left out.
     """
     sides: dict[tuple[str, ...], dict[str, str]] = {}
-    alone = 0
     for name in names:
         words = words_of(os.path.splitext(name)[0])
         at = next((k for k in range(len(words)) if _side_at(words, k) is not None), None)

@@ -288,6 +288,7 @@ class FrameUpdate:
         return share < _UPDATE.in_view
 
     def _corrected(self, window: Window, pixels: Views) -> Views:
+        """Return the landmarks' pixels without the rectification error."""
         field = self._rig.field(window)
         return pixels if field is None else field.corrected(pixels)
 
@@ -477,13 +478,9 @@ class FrameUpdate:
 
     def _landmark_residuals(self, window: Window, pixels: Views) -> LandmarkResiduals:
         """Residuals of the landmarks' pixels in the newest exposure."""
-        field = self._rig.field(window)
-        if field is not None:
-            pixels = field.corrected(pixels)
         T = window.T_cam0_world(-1)[0]
-        return landmark_residuals(
-            self._rig.camera, T, window.landmarks, pixels, self.tracks.variance
-        )
+        seen = self._corrected(window, pixels)
+        return landmark_residuals(self._rig.camera, T, window.landmarks, seen, self.tracks.variance)
 
     def _gate_landmarks(self, window: Window, pixels: Views, fitted: Fit) -> tuple[Views, IntArray]:
         """Test the landmarks' pixels after a fit; drop the landmarks that keep failing.

@@ -46,7 +46,7 @@ from vio.geometry.stereo import StereoCamera, left_rays
 from vio.geometry.upright import rotation_to_up
 from vio.imu.standstill import STANDSTILL_S
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import ImuSample, Observations
+from vio.records import ImuSample, Observations, shared_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ def is_still(
     before = [f for f in frames if now.time_ns - f.time_ns >= 0.9e9 * STANDSTILL_S]
     if not before:
         return False
-    _, a, b = np.intersect1d(before[-1].ids, now.ids, assume_unique=True, return_indices=True)
+    a, b = shared_rows(before[-1].ids, now.ids)
     if len(a) < _START.min_tracks:
         return False
     moved = np.linalg.norm(before[-1].z[a, :2] - now.z[b, :2], axis=1)

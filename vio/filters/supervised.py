@@ -264,10 +264,6 @@ class SupervisedMsckf(Backend):
         """Return the body's motion between two frames of the window, see `Msckf`."""
         return self._active.relative(older, newer)
 
-    def imu_terms_covariance(self) -> FloatArray:
-        """Return the covariance (15, 15) of the errors of `Estimate.imu_terms`, see `Msckf`."""
-        return self._filter.imu_terms_covariance()
-
     def landmarks(self) -> Landmarks:
         """Return the points of all tracks that fix their depth, see `Msckf`."""
         own = self._active.landmarks()

@@ -70,8 +70,7 @@ class DisplacedMatches(MatchCheck):
         state.show(index, sign)
         if not sign and state.since is None:
             self._learn(terms, rows, off_px)
-        if state.to_report:
-            state.reported = True
+        if state.to_report():
             message = (
                 f"frame {index}: the right pixels contradict the left ones since frame "
                 f"{state.since}: their rows are off by {off_px:.1f} px more than before; the right "

@@ -59,8 +59,7 @@ class ExchangedMatches(Finder):
                 f"disparities are negative, in {_RULES.frames} frames); exchange the columns of the "
                 "features, or the cameras' calibration"
             )
-        if self._in_order and state.to_report:
-            state.reported = True
+        if self._in_order and state.to_report():
             message = (
                 f"frame {index}: left and right pixels are exchanged from here on, as {negative} of "
                 f"{matches} disparities are negative; they are put back"

@@ -37,8 +37,7 @@ class FrozenMatches(MatchCheck):
         index = seen.frame_index
         state = self._state
         state.show(index, _is_frozen(shared))
-        if state.to_report:
-            state.reported = True
+        if state.to_report():
             message = (
                 f"frame {index}: the right camera is frozen since frame {state.since}: its pixels "
                 "stay while the left ones move; going on with the left ones"

@@ -42,8 +42,7 @@ class LostMatches(MatchCheck):
         if share is not None and state.since is None:
             usual = share if self._usual is None else self._usual
             self._usual = usual + _RULES.gain * (share - usual)
-        if state.to_report and share is not None:
-            state.reported = True
+        if share is not None and state.to_report():
             message = (
                 f"frame {index}: hardly any feature has a right match since frame {state.since} "
                 f"({100 * share:.0f} % instead of {100 * (self._usual or 0.0):.0f} %); the right "

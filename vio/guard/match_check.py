@@ -12,7 +12,7 @@ import numpy as np
 
 from vio.findings import Finder
 from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, IntArray, Observations
+from vio.records import BoolArray, IntArray, Observations, shared_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ def shared_matches(before: Observations | None, now: Observations) -> SharedMatc
     if before is None:
         nothing = np.zeros((0, 4))
         return SharedMatches(0, np.zeros(0, dtype=np.int64), nothing, nothing, 0.0)
-    _, old, new = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    old, new = shared_rows(before.ids, now.ids)
     had = before.has_right[old]
     both = had & now.has_right[new]
     return SharedMatches(
@@ -82,7 +82,7 @@ class Hysteresis:
         self._unsigned = 0
         self.frames = 0  # that showed it
         self.since: int | None = None  # first frame that showed it; None: it is not so
-        self.reported = False
+        self._reported = False
 
     def show(self, index: int, sign: bool | None) -> None:
         """Take what a frame shows: the state, the contrary, or (None) neither."""
@@ -97,19 +97,23 @@ class Hysteresis:
             self._unsigned = 0
             self._contrary += 1
 
-    @property
     def to_report(self) -> bool:
-        """Whether the state lasts for long enough, and was not reported yet."""
-        return self.since is not None and not self.reported and self.frames >= self._to_report
+        """Return whether the state has lasted for long enough and was not reported yet; it then
+        counts as reported.
+        """
+        if self.since is None or self._reported or self.frames < self._to_report:
+            return False
+        self._reported = True
+        return True
 
     def ends(self) -> bool:
         """Return whether the state ends with this frame and was reported; it is then forgotten."""
         over = self._contrary >= self._to_end or self._unsigned >= self._blind
         if self.since is None or not over:
             return False
-        reported = self.reported
+        reported = self._reported
         self.since = None
-        self.reported = False
+        self._reported = False
         self.frames = 0
         return reported
 

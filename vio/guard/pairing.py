@@ -123,8 +123,7 @@ class PairingCheck(ImageCheck):
         points = min(len(now.corners), len(last.corners))
         if points >= _MIN_POINTS:
             self._points += points
-            for delay, (left, right) in {0: (now, now), 1: (last, now), -1: (now, last)}.items():
-                self._matched[delay] += self._probe.on_rows(left.left, right.right, left.corners)
+            self._add({0: (now, now), 1: (last, now), -1: (now, last)}, self._matched)
         told = told_delay(self._points, self._matched)
         self._told.append(told if told == 0 else self._far_delay(now))
         recent = self._told[-_ALIKE:]
@@ -132,6 +131,13 @@ class PairingCheck(ImageCheck):
             self._decide(index, recent[0])
         elif len(self._told) >= _MAX_TESTS:
             self._decide(index, 0)
+
+    def _add(
+        self, pairings: Mapping[int, tuple[_Halves, _Halves]], matched: dict[int, int]
+    ) -> None:
+        """Add how many corners of the left image of each pairing match in its right one."""
+        for delay, (left, right) in pairings.items():
+            matched[delay] += self._probe.on_rows(left.left, right.right, left.corners)
 
     def _far_delay(self, now: _Halves) -> int | None:
         """Count the matches of a frame in all pairings, and return the delay that they tell, unless
@@ -148,8 +154,7 @@ class PairingCheck(ImageCheck):
         if points < _MIN_POINTS:
             return None
         self._far_points += points
-        for delay, (left, right) in pairings.items():
-            self._far_matched[delay] += self._probe.on_rows(left.left, right.right, left.corners)
+        self._add(pairings, self._far_matched)
         told = told_delay(self._far_points, self._far_matched)
         if told is None or told == 0:
             return told

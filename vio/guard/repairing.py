@@ -23,6 +23,16 @@ def repaired(events: Iterable[Event], delay: int) -> Iterator[Event]:
     return iter(events) if delay == 0 else _paired(events, abs(delay), right_is_late=delay > 0)
 
 
+def late_text(delay: int) -> str:
+    """Say which images of a recording are late and by how many frames, `delay` as of `repaired`."""
+    late, other = ("right", "left") if delay > 0 else ("left", "right")
+    frames = "a frame" if abs(delay) == 1 else f"{abs(delay)} frames"
+    return (
+        f"each {late} image comes {frames} later than the {other} one of its time, by the rows that "
+        "match"
+    )
+
+
 def _paired(events: Iterable[Event], frames: int, *, right_is_late: bool) -> Iterator[Event]:
     held = deque[Event]()  # from the frame on that waits
     waiting = 0  # frames among them

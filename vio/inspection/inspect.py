@@ -9,6 +9,7 @@ import numpy as np
 from vio.datasets.samples import motion_samples
 from vio.findings import Finding
 from vio.geometry.rectify import field_of_view
+from vio.guard.repairing import late_text
 from vio.imu.clocks import judge_clocks
 from vio.imu.findings import InertialFinding
 from vio.imu.sampling import sampled_hz
@@ -211,12 +212,9 @@ def _tracking_parts(
 
 def _shifted_text(found: Finding) -> str:
     """Return what is wrong with pairs of different times."""
-    delay = round(found.figures["delay_frames"])
-    late, other = ("right", "left") if delay > 0 else ("left", "right")
-    frames = "a frame" if abs(delay) == 1 else f"{abs(delay)} frames"
     return (
-        f"each {late} image comes {frames} later than the {other} one of its time, by the rows that "
-        "match; pair the images by their times of exposure (a run pairs them anew, and says so)"
+        f"{late_text(round(found.figures['delay_frames']))}; pair the images by their times of "
+        "exposure (a run pairs them anew, and says so)"
     )
 
 

@@ -87,11 +87,10 @@ def judge_force(
         wrong = _wrong_axes(evidence.early_force, R * unit)
         if wrong is not None:
             return [wrong], True
-        scaled = None
         if camera is not None:
             scaled = _wrong_scale(evidence.early_force, R * unit, camera)
-        if scaled is not None:
-            return [scaled], True
+            if scaled is not None:
+                return [scaled], True
     if force is not None:
         scale, sigma = force.sign(R * unit)
         if abs(scale) > _SIGN_SIGMAS * sigma and 0.5 < abs(scale) < 2.0:

@@ -32,6 +32,7 @@ from vio.records import (
     Prediction,
     StereoFrame,
     TrackPrior,
+    shared_rows,
 )
 
 _RADIUS = 4  # of the patches whose flow is measured, pixels
@@ -223,7 +224,7 @@ def _moved(before: Observations, now: Observations | TrackPrior) -> tuple[IntArr
     """Features that two sets share: their rows (K,) in the first, and by how many pixels (K,) they
     differ in the left image.
     """
-    _, a, b = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    a, b = shared_rows(before.ids, now.ids)
     return a, np.asarray(np.linalg.norm(now.z[b, :2] - before.z[a, :2], axis=1))
 
 

@@ -64,7 +64,7 @@ class RunHealth:
         self._last = estimate.time_ns, estimate.T_world_imu[:3, 3].copy()
         if last_ns is not None and (estimate.time_ns - last_ns) * 1e-9 < _RESTART_EVENT_S:
             return ()
-        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        sigma = _position_sigma(estimate)
         message = (
             f"frame {index}: {why}; started again from the last good pose, the standard deviation "
             f"of its position is {sigma:.2f} m"
@@ -76,7 +76,7 @@ class RunHealth:
         found of the state before is forgotten.
         """
         self._last = estimate.time_ns, estimate.T_world_imu[:3, 3].copy()
-        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        sigma = _position_sigma(estimate)
         ago_s = (estimate.time_ns - good_ns) / NS_PER_S
         message = (
             f"frame {index}: the filter was begun anew by the sensors, as its state was impossible; "
@@ -121,7 +121,7 @@ class RunHealth:
         self._steps_s.append(step_s)
         if step_s <= max(_GAP_S, _GAP_STEPS * usual_s):
             return []
-        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        sigma = _position_sigma(estimate)
         message = (
             f"frame {index}: no frame for {step_s:.2f} s since frame {last_index}; the motion in "
             f"between is a prediction, the standard deviation of the position is {sigma:.2g} m "
@@ -207,7 +207,7 @@ class RunHealth:
         if self._without_features or seconds < _NO_FEATURES_S:
             return []
         self._without_features = True
-        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        sigma = _position_sigma(estimate)
         message = (
             f"frame {index}: no usable feature since frame {self._last_used[0]} ({seconds:.1f} s); "
             f"the pose is a prediction, the standard deviation of its position is {sigma:.2f} m"
@@ -242,6 +242,11 @@ class RunHealth:
         self._reported.add(what)
         message = f"{line}; check the order of the images, calibration, units and clocks"
         return [Finding("estimate-implausible", message, index, lasts=True)]
+
+
+def _position_sigma(estimate: Estimate) -> float:
+    """Standard deviation of the position, m."""
+    return float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
 
 
 _SPAN_S = 1.0

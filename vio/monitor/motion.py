@@ -13,7 +13,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.monitor.samples import GAP_S, MEMORY_S
 from vio.numerics.robust import median
-from vio.records import S_PER_NS, BoolArray, IntArray, Observations, feature_tracks
+from vio.records import S_PER_NS, BoolArray, IntArray, Observations, feature_tracks, shared_rows
 
 BATCH = 20  # frames whose motion is computed at once
 _TRACKS = 80  # tracks of a frame that the camera's motion is computed from
@@ -55,7 +55,7 @@ class CameraTwists:
         kept = seen.take(rows)
         if self._kept:
             last = self._kept[-1]
-            _, a, b = np.intersect1d(last.ids, kept.ids, assume_unique=True, return_indices=True)
+            a, b = shared_rows(last.ids, kept.ids)
             self._links.append(len(a))
             self._guess.append(self._initial_rotation(last, kept, kept.z[b, :2] - last.z[a, :2]))
         self._kept.append(kept)

@@ -24,7 +24,7 @@ from vio.findings import Finding
 from vio.frontend import one_opencv_thread
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
-from vio.guard.repairing import repaired
+from vio.guard.repairing import late_text, repaired
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, recorded_source
 from vio.live.processor import EventProcessor
 from vio.numerics.threads import one_blas_thread
@@ -479,12 +479,9 @@ class _Loop:
 
 def _paired_anew_line(delay: int) -> str:
     """Say that a run has begun again."""
-    late, other = ("right", "left") if delay > 0 else ("left", "right")
-    frames = "a frame" if abs(delay) == 1 else f"{abs(delay)} frames"
     return (
-        f"each {late} image comes {frames} later than the {other} one of its time, by the rows that "
-        "match; the run began again with the right pairs; pair the images by their times of "
-        "exposure"
+        f"{late_text(delay)}; the run began again with the right pairs; pair the images by their "
+        "times of exposure"
     )
 
 
