@@ -90,7 +90,8 @@ def verdict(form: Form) -> str:
     doubts = [note for note in rig.notes if "doubtful" in note]
     if not doubts:
         return "read"
-    return f"read with a doubt: {_plain(doubts[0], folder).removeprefix('doubtful: ')}"
+    doubt = _plain(doubts[0], folder).removeprefix("doubtful: ")
+    return f"read with a doubt: {doubt.split('; ')[0]} …"  # the message goes on with remedies
 
 
 def _plain(message: str, folder: str) -> str:

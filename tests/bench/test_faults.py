@@ -182,7 +182,7 @@ def test_a_wrong_unit_is_on_every_sample() -> None:
             np.testing.assert_array_equal(new.accel, old.accel)
 
 
-def test_the_table_shows_errors_ratios_and_what_was_said() -> None:
+def test_the_tables_show_errors_ratios_and_codes_that_the_recording_as_it_is_has_not() -> None:
     row = {
         "recording": "r",
         "motion": "none",
@@ -190,24 +190,13 @@ def test_the_table_shows_errors_ratios_and_what_was_said() -> None:
         "variant": "clean",
         "ate_m": 0.004,
         "ratio": 1.0,
+        "codes": ["rows-off"],
     }
-    usual = "frame 3: rows differ by 0.3 px: known"
     rows = [
-        row | {"said": [usual]},
-        row
-        | {
-            "variant": "night",
-            "ate_m": 0.0051,
-            "said": ["frame 9: rows differ by 0.4 px: known", "frame 7: alarm"],
-        },
-        row
-        | {
-            "group": "cameras",
-            "variant": "black",
-            "ratio": 0.25,
-            "said": ["frame 5: images are black; left out"],
-        },
-        row | {"group": "imu", "variant": "zero", "said": [], "error": "DataError: refused"},
+        row,
+        row | {"variant": "night", "ate_m": 0.0051, "codes": ["rows-off", "bands"]},
+        row | {"group": "cameras", "variant": "black", "ratio": 0.25, "codes": ["no-features"]},
+        row | {"group": "imu", "variant": "zero", "error": "DataError: refused"},
     ]
     text = page(
         {
@@ -220,11 +209,12 @@ def test_the_table_shows_errors_ratios_and_what_was_said() -> None:
         }
     )
     assert "commit abc" in text
+    assert "| variant | r, images alone |" in text
     assert "| clean | 4 |" in text
-    assert "| night | 5.1 [1] |" in text
-    assert "1. r, none, night: frame 7: alarm" in text
-    assert "| r, none | cameras: black | 4 | 0.2 | images are black |" in text
-    assert "| r, none | imu: zero | 4 | 1.0 | DataError: refused |" in text
+    assert "| night | 5.1 `bands` |" in text
+    assert "### r, images alone" in text
+    assert "| black | 4 | 0.2 | `no-features` |" in text
+    assert "| zero | 4 | 1.0 | DataError: refused |" in text
 
 
 def test_the_page_shows_what_was_run() -> None:

@@ -117,7 +117,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
         "ate_m": errors_m.rmse,
         "sigma_m": sigma_m,
         "ratio": ratio,
-        "said": list(result.warnings),
+        "codes": list(dict.fromkeys(finding.code for finding in result.findings)),
     }
 
 

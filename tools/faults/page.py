@@ -4,7 +4,6 @@ runs.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,14 +11,14 @@ from vio.bench.tables import provenance
 
 _PAGE = """# Faults and healthy variants
 
-Real recordings, changed in memory by `python -m tools.faults`; ATE in millimetres after SE(3) alignment.
+Real recordings, changed in memory by `python -m tools.faults`; ATE in millimetres after SE(3) alignment, and the
+[codes](findings.md) of what a run found that are not those of the recording as it is.
 {provenance}.
 
 ## Healthy variants
 
 What a good rig may deliver: no check may act on it. The mirrored pair has exchanged cameras, so the path of the other
-camera is estimated, and compared with its own truth. Numbers in brackets: lines that are said of the variant, but not
-of the recording as it is.
+camera is estimated, and compared with its own truth.
 
 {healthy}
 
@@ -27,7 +26,7 @@ of the recording as it is.
 
 From 40 % of the recording on, for three seconds or to its last fifth, unless the name says otherwise. *Ratio*: largest
 error over the largest stated standard deviation of a position; images alone, and short recordings with little motion,
-state too little already without a fault. What was said is cut to its beginning.
+state too little already without a fault.
 
 {faults}
 """
@@ -36,61 +35,61 @@ Row = Mapping[str, Any]
 
 def page(facts: Mapping[str, Any]) -> str:
     """Return the page, Markdown: healthy variants, and faults."""
-    healthy = [row for row in facts["runs"] if row["group"] == "healthy"]
-    faults = [row for row in facts["runs"] if row["group"] != "healthy"]
+    rows = facts["runs"]
+    usual = {_run(row): row["codes"] for row in rows if row["variant"] == "clean"}
     tables = {
-        "healthy": "\n".join(_healthy_table(healthy)),
-        "faults": "\n".join(_fault_table(faults)),
+        "healthy": _healthy_tables([row for row in rows if row["group"] == "healthy"], usual),
+        "faults": _fault_tables([row for row in rows if row["group"] != "healthy"], usual),
     }
     return _PAGE.format(provenance=provenance(facts), **tables)
 
 
-def _healthy_table(rows: Sequence[Row]) -> list[str]:
-    """ATE of each variant on each recording, with the lines that are said of it but not of the
-    recording as it is.
-    """
-    heads = list(dict.fromkeys((row["recording"], row["motion"]) for row in rows))
-    cells = {(row["recording"], row["motion"], row["variant"]): row for row in rows}
-    lines = ["| variant | " + " | ".join(f"{name}, {motion}" for name, motion in heads) + " |"]
-    lines.append("|---|" + "---|" * len(heads))
-    notes: list[str] = []
+def _healthy_tables(rows: Sequence[Row], usual: Mapping[str, Sequence[str]]) -> str:
+    """ATE of each variant on each recording, with the codes that only the variant has."""
+    runs = list(dict.fromkeys(map(_run, rows)))
+    cells = {(_run(row), row["variant"]): row for row in rows}
+    lines = ["| variant | " + " | ".join(runs) + " |", "|---|" + "---|" * len(runs)]
     for variant in dict.fromkeys(row["variant"] for row in rows):
-        shown = []
-        for head in heads:
-            row = cells.get((*head, variant), {})
-            clean = cells.get((*head, "clean"), {})
-            extra = (
-                [row["error"]]
-                if "error" in row
-                else _unlike(row.get("said", []), clean.get("said", []))
+        shown = [
+            " ".join(
+                filter(
+                    None, (_millimetres(cells[run, variant]), _found(cells[run, variant], usual))
+                )
             )
-            marks = "".join(f" [{len(notes) + k}]" for k in range(1, len(extra) + 1))
-            notes += [f"{head[0]}, {head[1]}, {variant}: {line}" for line in extra]
-            shown.append(_millimetres(row) + marks if row else "")
-        lines.append(f"| {variant} | " + " | ".join(shown) + " |")
-    return [*lines, *([""] if notes else []), *(f"{k}. {note}" for k, note in enumerate(notes, 1))]
-
-
-def _fault_table(rows: Sequence[Row]) -> list[str]:
-    lines = ["| recording | fault | ATE mm | ratio | said |", "|---|---|---|---|---|"]
-    for row in rows:
-        lines_said = [
-            re.sub(r"^(frame \d+|gyro \w+|accelerometer \w+): ", "", line)
-            for line in row.get("said", [])
+            if (run, variant) in cells
+            else ""
+            for run in runs
         ]
-        said = row.get("error") or "; ".join(
-            dict.fromkeys(re.split(r"[:;,] ", line)[0] for line in lines_said)
-        )
-        ratio = f"{row['ratio']:.1f}" if "ratio" in row else ""
-        name = f"{row['recording']}, {row['motion']} | {row['group']}: {row['variant']}"
-        lines.append(f"| {name} | {_millimetres(row)} | {ratio} | {said} |")
-    return lines
+        lines.append(f"| {variant} | " + " | ".join(shown) + " |")
+    return "\n".join(lines)
 
 
-def _unlike(said: Sequence[str], usual: Sequence[str]) -> list[str]:
-    """The lines that differ from the usual ones by more than numbers."""
-    known = {re.sub(r"[\d.]+", "", line) for line in usual}
-    return [line for line in said if re.sub(r"[\d.]+", "", line) not in known]
+def _fault_tables(rows: Sequence[Row], usual: Mapping[str, Sequence[str]]) -> str:
+    """A table for each recording: error, ratio and codes of each fault."""
+    tables = []
+    for run in dict.fromkeys(map(_run, rows)):
+        lines = [f"### {run}", "", "| fault | ATE mm | ratio | found |", "|---|---:|---:|---|"]
+        for row in rows:
+            if _run(row) == run:
+                ratio = f"{row['ratio']:.1f}" if "ratio" in row else ""
+                cells = f"{row['variant']} | {_millimetres(row)} | {ratio}"
+                lines.append(f"| {cells} | {_found(row, usual)} |")
+        tables.append("\n".join(lines))
+    return "\n\n".join(tables)
+
+
+def _run(row: Row) -> str:
+    """The recording and the motion sensor of a row."""
+    motion = {"none": "images alone", "imu": "with IMU"}
+    return f"{row['recording']}, {motion.get(row['motion'], row['motion'])}"
+
+
+def _found(row: Row, usual: Mapping[str, Sequence[str]]) -> str:
+    """The codes of a run that the recording as it is has not, or its error."""
+    if "error" in row:
+        return str(row["error"])
+    known = usual.get(_run(row), ())
+    return ", ".join(f"`{code}`" for code in row["codes"] if code not in known)
 
 
 def _millimetres(row: Row) -> str:
