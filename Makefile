@@ -16,7 +16,7 @@ endif
 TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 # `make test CONSTRAINTS=` installs the newest versions that pyproject.toml allows.
 CONSTRAINTS ?= constraints.txt
-PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(addprefix -c ,$(CONSTRAINTS))
+PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check $(addprefix -c ,$(CONSTRAINTS))
 
 .PHONY: demo quick test lint unit oldest coverage mutations bench results wheel arm docs release clean constraints
 

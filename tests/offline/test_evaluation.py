@@ -31,7 +31,7 @@ from vio.evaluation.errors_along_path import (
     relative_error_frames,
     rotation_angle_deg,
 )
-from vio.evaluation.trajectories import evaluate, lengths_text
+from vio.evaluation.trajectories import evaluate, lengths_text, metres_texts
 from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import (
     FloatArray,
@@ -1030,3 +1030,9 @@ def test_notes_an_estimate_with_few_references() -> None:
     T = np.array([se3_exp(np.array([0.1 * k, 0, 0, 0, 0, 0])) for k in range(60)])
     score = evaluate(timed(T), timed(T[:10]))
     assert any("covers 15 % of the estimate" in note for note in score.notes)
+
+
+def test_lengths_that_are_compared_have_one_unit() -> None:
+    assert metres_texts(0.00888, 0.319, 1.5) == ["8.88 mm", "319 mm", "1500 mm"]
+    assert metres_texts(0.0123, 0.319) == ["0.012 m", "0.319 m"]
+    assert metres_texts() == []

@@ -197,19 +197,22 @@ def _evaluated(
 
 def _side_by_side(results: Mapping[str, Evaluation]) -> Iterator[tuple[str, str]]:
     """Yield the main figures of several trajectories as one table, one line each."""
-    from vio.evaluation.trajectories import metres_text
+    from vio.evaluation.trajectories import metres_texts
 
+    ates = metres_texts(*(r.ate_m.rmse for r in results.values()))
+    known = [name for name, r in results.items() if r.rpe is not None]
+    steps = metres_texts(*(r.rpe.trans_rmse_m for r in results.values() if r.rpe is not None))
+    rpes = dict(zip(known, steps, strict=True))
     names = {name: name if len(name) <= _NAME else "…" + name[1 - _NAME :] for name in results}
     yield (
         "",
         f"{'':<{_NAME}} {'poses':>7} {'ATE':>10} {'attitude':>10} {'scale':>9} {'RPE':>10} "
         f"{'drift':>8}",
     )
-    for name, r in results.items():
+    for (name, r), ate in zip(results.items(), ates, strict=True):
         scale = "–" if r.scale_free is None else f"{100 * (r.scale_free.scale - 1):+.3f} %"
-        rpe = "–" if r.rpe is None else metres_text(r.rpe.trans_rmse_m)
+        rpe = rpes.get(name, "–")
         drift = "–" if r.kitti is None else f"{r.kitti.t_err_percent:.3f} %"
-        ate = metres_text(r.ate_m.rmse)
         figures = (
             f"{r.matched:>7} {ate:>10} {r.ate_deg.rmse:>6.3f} deg {scale:>9} {rpe:>10} {drift:>8}"
         )

@@ -145,9 +145,8 @@ def _rows(m: dict[str, Any]) -> list[tuple[str, str]]:
     if m["loops"]:
         rows.insert(1, ("loops", f"{m['loops']}, whose matches are points; poses began in the map"))
     if m["ate_m"] is not None:
-        from vio.evaluation.trajectories import metres_text
+        from vio.evaluation.trajectories import metres_texts
 
-        rows.append(
-            ("ATE", f"{metres_text(m['ate_before_m'])} before, {metres_text(m['ate_m'])} after")
-        )
+        before, after = metres_texts(m["ate_before_m"], m["ate_m"])
+        rows.append(("ATE", f"{before} before, {after} after"))
     return [*rows, ("time", f"{m['seconds']:.1f} s"), ("results", m["out"])]

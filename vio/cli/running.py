@@ -18,7 +18,12 @@ from vio.dataclass import dataclass
 from vio.datasets import open_dataset
 from vio.datasets.frame_times import Seconds, frames_between, used_frames
 from vio.errors import NOTE, CalibrationError, ConfigError, DataError, StoppedError, VioError
-from vio.evaluation.trajectories import lengths_text, metres_text, rotation_drift_text
+from vio.evaluation.trajectories import (
+    lengths_text,
+    metres_text,
+    metres_texts,
+    rotation_drift_text,
+)
 from vio.files.atomic import (
     atomic_write_bytes,
     atomic_write_text,
@@ -625,17 +630,15 @@ def _error_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("ATE", "no reference"))
     else:
         against = metrics["dead_reckoning"]
-        beside = "" if against is None else f"   (dead reckoning {metres_text(against['ate_m'])})"
-        rows.append(("ATE", f"{metres_text(metrics['ate_m'])} after SE(3) alignment{beside}"))
         free = metrics["evaluation"]["scale_free"]
+        scores = (metrics, free, against)
+        texts = iter(metres_texts(*(score["ate_m"] for score in scores if score is not None)))
+        rows.append(("ATE", f"{next(texts)} after SE(3) alignment"))
         if free is not None:
-            rows.append(
-                (
-                    "",
-                    f"{metres_text(free['ate_m'])} after Sim(3), scale off by "
-                    f"{100 * (free['scale'] - 1):+.2f} %",
-                )
-            )
+            off = f"{100 * (free['scale'] - 1):+.2f} %"
+            rows.append(("", f"{next(texts)} after Sim(3), scale off by {off}"))
+        if against is not None:
+            rows.append(("", f"{next(texts)} by dead reckoning"))
     if metrics["t_err_percent"] is not None:
         over = lengths_text(metrics["drift_lengths_m"])
         turned = rotation_drift_text(metrics["r_err_deg_per_100m"], metrics["drift_lengths_m"])

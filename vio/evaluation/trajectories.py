@@ -269,7 +269,14 @@ def metres_text(value_m: float) -> str:
     """Return a length with its unit: millimetres below a centimetre, else metres with three
     decimals.
     """
-    return f"{1e3 * value_m:.3g} mm" if value_m < _MILLIMETRES_BELOW_M else f"{value_m:.3f} m"
+    return metres_texts(value_m)[0]
+
+
+def metres_texts(*values_m: float) -> list[str]:
+    """Return lengths that are compared with one another, all in the unit of the smallest."""
+    if min(values_m, default=np.inf) < _MILLIMETRES_BELOW_M:
+        return [f"{1e3 * v:.0f} mm" if v >= 1.0 else f"{1e3 * v:.3g} mm" for v in values_m]
+    return [f"{v:.3f} m" for v in values_m]
 
 
 def lengths_text(lengths_m: Sequence[float]) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.evaluation.alignment import align_poses
-from vio.evaluation.trajectories import metres_text
+from vio.evaluation.trajectories import metres_texts
 from vio.geometry.lie import FloatArray, se3_from_parts
 from vio.report.words import run_figures, smaller_is_better
 from vio.runs.finished import FinishedRun
@@ -24,9 +24,10 @@ class Apart:
     distance_m: FloatArray  # (K,)
 
     def __str__(self) -> str:
-        rms = float(np.sqrt(np.mean(self.distance_m**2)))
-        most = float(self.distance_m.max())
-        return f"{metres_text(rms)} (rms), at most {metres_text(most)}, {len(self.seconds)} frames"
+        rms, most = metres_texts(
+            float(np.sqrt(np.mean(self.distance_m**2))), float(self.distance_m.max())
+        )
+        return f"{rms} (rms), at most {most}, {len(self.seconds)} frames"
 
 
 def apart(first: FinishedRun, other: FinishedRun) -> Apart | None:

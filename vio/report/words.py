@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vio.evaluation.errors_along_path import path_length_m
-from vio.evaluation.trajectories import lengths_text, metres_text, rotation_drift_text
+from vio.evaluation.trajectories import lengths_text, metres_texts, rotation_drift_text
 from vio.records import STAGES
 from vio.runs.folder import refused_share
 
@@ -45,10 +45,10 @@ def summary(run: FinishedRun) -> list[str]:
         )
     else:
         share = 100 * evaluation.ate_m.rmse / max(evaluation.reference_path_length_m, 1e-9)
+        rms, most = metres_texts(evaluation.ate_m.rmse, evaluation.ate_m.max)
         lines.append(
-            f"The position error is {metres_text(evaluation.ate_m.rmse)} (rms after alignment, "
-            f"{share:.2g} % of the "
-            f"path), at most {metres_text(evaluation.ate_m.max)}; the attitude error "
+            f"The position error is {rms} (rms after alignment, {share:.2g} % of the "
+            f"path), at most {most}; the attitude error "
             f"{evaluation.ate_deg.rmse:.2g} deg."
         )
         if evaluation.kitti is not None:
@@ -135,14 +135,19 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
     evaluation = run.evaluation
     work = _work_ms(run)
     kitti = None if evaluation is None else evaluation.kitti
+    ate, largest = (
+        ("–", "–")
+        if evaluation is None
+        else metres_texts(evaluation.ate_m.rmse, evaluation.ate_m.max)
+    )
     refused = refused_share(run.frames["used"], run.frames["gated"])
     innovations = m.get("innovation_ratio")
     return {
         "frames": str(len(run.estimates)),
         "path (m)": f"{path_length_m(run.trajectory.positions):.2f}",
         "back end": f"{m.get('backend', '–')}, motion {m.get('motion', '–')}",
-        "ATE": "–" if evaluation is None else metres_text(evaluation.ate_m.rmse),
-        "largest error": "–" if evaluation is None else metres_text(evaluation.ate_m.max),
+        "ATE": ate,
+        "largest error": largest,
         "attitude error (deg)": "–" if evaluation is None else f"{evaluation.ate_deg.rmse:.3f}",
         "drift (%)": "–" if kitti is None else f"{kitti.t_err_percent:.3f}",
         "drift of rotation": "–"

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vio.errors import EvaluationError, VioError
-from vio.evaluation.trajectories import Evaluation, metres_text
+from vio.evaluation.trajectories import Evaluation, metres_text, metres_texts
 from vio.files.atomic import atomic_write_bytes
 from vio.files.printable import printable
 from vio.files.tables import Rows
@@ -397,8 +397,11 @@ def _compare_paths(axes: Any, results: Mapping[str, Evaluation], chosen: str | N
         labels = [f"{axis} (m)" for axis in chosen]
     flat = (truth - origin) @ plane.T
     axes.plot(*flat.T, color=_REFERENCE, lw=3.0, label="reference")
-    for (name, r), colour in zip(results.items(), itertools.cycle(COLOURS), strict=False):
-        label = f"{name}: ATE {metres_text(r.ate_m.rmse)}"
+    ates = metres_texts(*(r.ate_m.rmse for r in results.values()))
+    for (name, r), ate, colour in zip(
+        results.items(), ates, itertools.cycle(COLOURS), strict=False
+    ):
+        label = f"{name}: ATE {ate}"
         axes.plot(*((r.aligned.positions - origin) @ plane.T).T, color=colour, lw=1.4, label=label)
     axes.plot(*flat[0], "o", color=_REFERENCE, ms=6, mfc="white", label="start")
     axes.plot(*flat[-1], "D", color=_REFERENCE, ms=6, mfc="white", label="end")
