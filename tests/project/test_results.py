@@ -126,8 +126,8 @@ def test_a_table_joins_systems_and_states_lengths() -> None:
     assert lines[1:5] == [
         "| ATE m | length | x | peer |",
         "|---|---:|---:|---:|",
-        "| drive A | 20 m | **0.1** | 0.2 |",
-        "| b | 7 m | **0.3** | 0.4 |",
+        "| drive A | 20 m | **0.100** | 0.200 |",
+        "| b | 7 m | **0.300** | 0.400 |",
     ]
 
 
@@ -181,7 +181,7 @@ def test_tables_and_figures_change_between_the_markers_only() -> None:
     text += "it is <!-- figure: paper/a/x/ate_m/2 -->9<!-- end figure --> m"
     new = with_figures(text, _results())
     assert new.startswith("a | 1 |\n<!-- suite: paper figure=ate_m -->\n| ATE m | x | peer |\n")
-    assert "| drive A | 0.123 ± 0.00014 | **0.05 [80 % of the frames]** |" in new
+    assert "| drive A | 0.123 | **0.0500 [80 % of the frames]** |" in new
     assert "| b | failed 1 of 1 | – [1] |" in new
     assert "*Suite `paper`, commit abc, 2030-01-02.*\n<!-- end -->\n| 2 |\n" in new
     assert new.endswith("<!-- figure: paper/a/x/ate_m/2 -->0.12<!-- end figure --> m")
@@ -211,7 +211,7 @@ def test_a_table_says_how_many_runs_succeeded() -> None:
         text, _results(runs=[*runs, ["a", "x", 2, {}, {}, "lost", {}]])
     ).splitlines()
     assert lines[1] == "| system | ATE m | runs | success |"
-    assert lines[3] == "| x | 0.2 ± 0.14, n = 2 | 2 of 3 | 33 % |"
+    assert lines[3] == "| x | 0.200 ± 0.14, n = 2 | 2 of 3 | 33 % |"
 
 
 def test_machines_and_versions_are_listed_once() -> None:

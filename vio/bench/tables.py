@@ -231,17 +231,28 @@ def number(value: float, digits: int) -> str:
     return f"{Decimal(f'{value:.{digits}g}'):f}"
 
 
+def _padded(value: float, digits: int) -> str:
+    """Return a number with so many significant digits, zeros at its end included."""
+    return f"{Decimal(f'{value:#.{digits}g}'):f}"
+
+
 def cell_text(
     cell: Cell, metric: Metric, runs: int | None = None, *, for_documents: bool = False
 ) -> str:
     """Return `median` or, where values differ, `median (mean ± standard deviation)`, with n
-    where it is not `runs`. `for_documents` leaves out the mean.
+    where it is not `runs`. `for_documents` leaves out the mean, and gives the standard deviation
+    with the median's decimals, where it has any of these.
     """
-    text = number(cell.median, metric.digits)
-    if cell.count > 1 and cell.spread > 0:
-        mean = number(cell.mean, metric.digits)
-        sd = number(cell.sd, 2)
-        text += f" ± {sd}" if for_documents else f" ({mean} ± {sd})"
+    differs = cell.count > 1 and cell.spread > 0
+    if for_documents:
+        whole = float(cell.median).is_integer()
+        text = number(cell.median, metric.digits) if whole else _padded(cell.median, metric.digits)
+        sd = min(f"{cell.sd:.{len(text.partition('.')[2])}f}", _padded(cell.sd, 2), key=len)
+        text += f" ± {sd}" if differs and float(sd) else ""
+    else:
+        text = number(cell.median, metric.digits)
+        if differs:
+            text += f" ({number(cell.mean, metric.digits)} ± {number(cell.sd, 2)})"
     return text if runs in (None, cell.count) else f"{text}, n = {cell.count}"
 
 
