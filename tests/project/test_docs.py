@@ -330,9 +330,7 @@ def test_live_use_runs(
     scope: dict[str, object] = {}
     for block in _python("docs/live.md"):
         _execute("docs/live.md", block, scope)
-        lines = capsys.readouterr().out.splitlines()
-        assert len(lines) > 5 or "LiveFigures(results=" in lines[0]
-    assert scope["newest"] is None or scope["newest"].time_ns >= 0  # type: ignore[attr-defined]
+        assert len(capsys.readouterr().out.splitlines()) > 5
 
 
 def test_the_output_files_of_a_run_exist(readme_folder: Path) -> None:
@@ -419,7 +417,7 @@ def test_every_python_block_is_run_by_one_of_the_tests_above() -> None:
     counts = {name: len(_python(name)) for name in DOCS}
     tested = {
         README: 1,
-        "docs/live.md": 2,
+        "docs/live.md": 1,
         "docs/simulation.md": 2,
         "docs/inertial.md": 1,
         "docs/maps.md": 1,
