@@ -162,6 +162,54 @@ def test_without_times_the_rate_of_the_file_counts_and_it_is_said(
     )
 
 
+def write_uneven(path: Path, images: list[np.ndarray], ticks: list[int]) -> None:
+    """Write gray images as JPEG, image k presented at a multiple of 50 ms."""
+    size = images[0].shape[1], images[0].shape[0]
+    code = cv2.VideoWriter_fourcc(*"MJPG")
+    even = path.with_suffix(".even.avi")
+    writer = cv2.VideoWriter(str(even), code, 20.0, size)
+    for image in images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    packets = cv2.VideoCapture(str(even), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    raw = [cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1]
+    copy = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, 20.0, size, raw)
+    assert copy.isOpened(), "this OpenCV has no Matroska"
+    for tick in ticks:
+        found, packet = packets.read()
+        assert found
+        copy.set(cv2.VIDEOWRITER_PROP_PTS, tick)
+        copy.set(cv2.VIDEOWRITER_PROP_KEY_FLAG, 1)
+        copy.write(packet)
+    copy.release()
+    packets.release()
+    even.unlink()
+
+
+@pytest.mark.skipif(
+    not hasattr(cv2, "VIDEOWRITER_PROP_PTS"), reason="this OpenCV writes no times of frames"
+)
+def test_frames_of_an_uneven_video_have_the_times_that_it_states(
+    videos: Path, flight: Path, tmp_path: Path
+) -> None:
+    """Each recorder has dropped frames of its own: pairs have one time, not one number."""
+    folder = copy_of(videos, tmp_path / "v", "times.txt", "imu.csv", "left.avi", "right.avi")
+    pairs = [(f.left, f.right) for f in frames_of(open_dataset(videos), 0, 16)]
+    kept = {"left": [k for k in range(16) if k not in (5, 6)], "right": [*range(9), *range(10, 16)]}
+    for camera, (side, ticks) in enumerate(kept.items()):
+        write_uneven(folder / f"{side}.mkv", [pairs[k][camera] for k in ticks], ticks)
+    dataset = open_dataset(folder)
+    both = [k for k in range(16) if k not in (5, 6, 9)]
+    assert dataset.recording.frame_times_ns.tolist() == [50_000_000 * k for k in both]
+    notes = " | ".join(dataset.recording.notes)
+    assert "have the presentation times of left.mkv, 50 to 150 ms apart" in notes
+    assert "1 frames of left.mkv and 2 of right.mkv have no partner of their time" in notes
+    for start in (0, 4):  # decoding from a later frame, too
+        for frame, k in zip(frames_of(dataset, start), both[start:], strict=True):
+            for seen, true in zip((frame.left, frame.right), pairs[k], strict=True):
+                assert np.abs(seen.astype(int) - true).mean() < 4.0
+
+
 def _truncate(folder: Path) -> None:
     data = (folder / "right.avi").read_bytes()
     (folder / "right.avi").write_bytes(data[: len(data) // 2])

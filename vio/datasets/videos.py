@@ -2,9 +2,11 @@
 in a plain folder, what else is beside them.
 
 Frame k of the one file belongs to frame k of the other. One file alone is taken to be side by side
-where the calibration is that of a pair whose images have half of its width. Frames are decoded in order, from the first
-on, because seeking in compressed video is not exact. Times come from `times.txt`, else from the
-frame rate that the files state.
+where the calibration is that of a pair whose images have half of its width. Frames are decoded in
+order, from the first on, because seeking in compressed video is not exact. Times come from
+`times.txt`, else from the frame rate that the files state. Where the presentation times of their
+frames do not follow that rate (phones, recorders that drop frames), these count, and frames belong
+together that have one time.
 """
 
 from __future__ import annotations
@@ -38,6 +40,8 @@ _NAMES = (
     ("video_0", "video_1"),
 )
 _RATES = (1.0, 1000.0)  # frames per second that a file can plausibly state
+_EVEN_NS = 2_000_000  # frames this close to an even grid have a constant rate
+_PAIRED = 0.25  # of the usual interval: how far apart the times of a pair may be
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +50,7 @@ class _Facts:
 
     count: int  # frames; containers may state a few too many
     rate_hz: float
+    times_ns: IntArray | None  # presentation times (F,); None: at a constant rate, or not stated
     width: int  # pixels
     height: int
 
@@ -79,8 +84,10 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
             f"{path}: holds no pair of videos (left.mp4 and right.mp4, or others); give a folder "
             "with both"
         )
-    left, right = (_facts(file) for file in files)
-    if abs(left.rate_hz - right.rate_hz) > 1e-3 * left.rate_hz:
+    left = _facts(files[0])
+    right = left if files[1] == files[0] else _facts(files[1])
+    uneven = left.times_ns is not None or right.times_ns is not None
+    if not uneven and abs(left.rate_hz - right.rate_hz) > 1e-3 * left.rate_hz:
         raise DataError(
             f"{files[0]} has {left.rate_hz:g} and {files[1].name} {right.rate_hz:g} frames per "
             "second; record both "
@@ -97,18 +104,13 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
             f"for images of {rig.cam0.width} x {rig.cam0.height}; side by side they would have "
             "twice that width; give left.mp4 and right.mp4, or the calibration of these images"
         )
-    times_ns, times_file, notes = _times(path, files, min(left.count, right.count), left.rate_hz)
+    times_ns, times_file, rows, notes = _times(path, files, (left, right))
     if one:
         notes.append(f"{files[0].name} holds the left and the right image side by side")
-    if left.count != right.count:
-        notes.append(
-            f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the "
-            "shorter counts"
-        )
     parts = read_companions(
         "video", layout, (file, rig), settings, (times_ns, times_file), notes, files
     )
-    return VideoDataset(*parts, files, imu_noise=rig.imu_noise)
+    return VideoDataset(*parts, files, rows, imu_noise=rig.imu_noise)
 
 
 def _facts(file: Path) -> _Facts:
@@ -127,24 +129,101 @@ def _facts(file: Path) -> _Facts:
         )
     if not _RATES[0] <= rate_hz <= _RATES[1]:
         rate_hz = 0.0
-    return _Facts(count, rate_hz, image.shape[1], image.shape[0])
+    times_ns = _stated_times(file)
+    if times_ns is not None and rate_hz and _is_even(times_ns, rate_hz):
+        times_ns = None
+    return _Facts(count, rate_hz, times_ns, image.shape[1], image.shape[0])
+
+
+def _stated_times(file: Path) -> IntArray | None:
+    """Return the presentation times (F,) of a file's frames, of its packets, which are not decoded;
+    None: it states none, or not one for each.
+    """
+    import cv2
+
+    packets = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    times_ms = []
+    try:
+        while packets.grab():
+            times_ms.append(packets.get(cv2.CAP_PROP_POS_MSEC))
+    finally:
+        packets.release()
+    times_ns = np.rint(1e6 * np.sort(times_ms)).astype(np.int64)  # packets are in decoding order
+    return times_ns if len(times_ns) > 1 and np.diff(times_ns).min() > 0 else None
+
+
+def _is_even(times_ns: IntArray, rate_hz: float) -> bool:
+    """Whether times follow a rate."""
+    grid_ns = times_ns[0] + np.arange(len(times_ns)) * (NS_PER_S / rate_hz)
+    return bool(np.abs(times_ns - grid_ns).max() < _EVEN_NS)
 
 
 def _times(
-    path: Path, files: tuple[Path, Path], count: int, rate_hz: float
-) -> tuple[IntArray, Path | None, list[str]]:
-    """Return the times (F,) of the frames, the file that states them, and notes."""
+    path: Path, files: tuple[Path, Path], facts: tuple[_Facts, _Facts]
+) -> tuple[IntArray, Path | None, IntArray, list[str]]:
+    """Return the times (F,) of the pairs, the file that states them, the frames (F, 2) of each pair
+    in both files, and notes.
+    """
+    left, right = facts
+    count = min(left.count, right.count)
+    rows = np.repeat(np.arange(count)[:, None], 2, axis=1)
+    shorter = (
+        [
+            f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the "
+            "shorter counts"
+        ]
+        if left.count != right.count
+        else []
+    )
     if (file := path / "times.txt").is_file():
         names = [(Path(f"{k}"), Path(f"{k}")) for k in range(count)]
         doubts = list[str]()
         times_ns = times_of(file, tuple(names), doubts)
-        return times_ns, file, doubts
-    if rate_hz == 0.0:
+        return times_ns, file, rows, doubts + shorter
+    if left.times_ns is not None or right.times_ns is not None:
+        return _uneven_times(files, facts)
+    if left.rate_hz == 0.0:
         raise DataError(
             f"{files[0]}: states no frame rate; write one time a frame into times.txt beside it"
         )
-    note = f"no times.txt: frames are {1e3 / rate_hz:.4g} ms apart, as {files[0].name} states; real cameras jitter"
-    return np.rint(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64), None, [note]
+    note = f"no times.txt: frames are {1e3 / left.rate_hz:.4g} ms apart, as {files[0].name} states; real cameras jitter"
+    times_ns = np.rint(np.arange(count) * (NS_PER_S / left.rate_hz)).astype(np.int64)
+    return times_ns, None, rows, [note, *shorter]
+
+
+def _uneven_times(
+    files: tuple[Path, Path], facts: tuple[_Facts, _Facts]
+) -> tuple[IntArray, Path | None, IntArray, list[str]]:
+    """Return what `_times` does, of files at least one of which has no constant rate."""
+    left_ns, right_ns = (
+        np.rint(np.arange(f.count) * (NS_PER_S / f.rate_hz)).astype(np.int64)
+        if f.times_ns is None
+        else f.times_ns
+        for f in facts
+    )
+    usual_ns = float(np.median(np.diff(left_ns)))
+    nearest = np.searchsorted(right_ns[:-1] + np.diff(right_ns) // 2, left_ns)
+    paired = np.flatnonzero(np.abs(right_ns[nearest] - left_ns) <= _PAIRED * usual_ns)
+    rows = np.column_stack([paired, nearest[paired]])
+    rows = rows[np.unique(rows[:, 1], return_index=True)[1]]
+    if not len(rows):
+        raise DataError(
+            f"{files[0]} and {files[1].name} have no two frames with one time; write one time a "
+            "frame into times.txt beside them"
+        )
+    times_ns = left_ns[rows[:, 0]]
+    apart_ms = 1e-6 * np.diff(times_ns) if len(times_ns) > 1 else np.zeros(1)
+    notes = [
+        f"no times.txt: frames have the presentation times of {files[0].name}, "
+        f"{apart_ms.min():.3g} to {apart_ms.max():.3g} ms apart"
+    ]
+    alone = tuple(len(times) - len(rows) for times in (left_ns, right_ns))
+    if any(alone):
+        notes.append(
+            f"{alone[0]} frames of {files[0].name} and {alone[1]} of {files[1].name} have no partner "
+            "of their time, and are left out"
+        )
+    return times_ns, None, rows, notes
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +233,7 @@ class VideoDataset(ImageRecording):
     """
 
     files: tuple[Path, Path]
+    rows: IntArray  # (F, 2) which frame of each file is in pair k
 
     def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         """Decode in order; the prefetch thread is the only one that uses the decoders."""
@@ -163,13 +243,14 @@ class VideoDataset(ImageRecording):
         files = self.files[: 1 if one else self.settings.cameras]
         captures = [cv2.VideoCapture(str(file)) for file in files]
 
-        # where the decoders are before a frame
-        after = dict(zip(chosen, [0, *(k + 1 for k in chosen)], strict=False))
+        decoded = [0] * len(captures)  # frames that each decoder is past
 
         def load(index: int) -> StereoFrame:
-            for capture in captures:
-                for _ in range(after[index], index):
+            for side, capture in enumerate(captures):
+                wanted = int(self.rows[index, side])
+                for _ in range(decoded[side], wanted):
                     capture.grab()
+                decoded[side] = wanted + 1
             images = [self._image(capture, side, index) for side, capture in enumerate(captures)]
             if one:
                 images = [half_of(images[0], side) for side in range(self.settings.cameras)]
