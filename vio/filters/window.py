@@ -453,6 +453,7 @@ class Window:
             loops.add_extrinsic_moves(T, self.nav.T_world_imu, error[state["extrinsics"]], moves)
         move_poses(moves, T)
         if len(self.landmarks):
+            before = self._landmarks_seen()
             self.landmarks = self.landmarks.copy()
             loops.move_points(of_clones[-3:], error[state.landmarks].reshape(-1, 3), self.landmarks)
         if isinstance(self.motion, ImuMotion):
@@ -466,6 +467,29 @@ class Window:
             )
         self.nav = self.motion.corrected(self.nav, error[state.motion])
         self.prior.delta = self.prior.delta + error
+        if len(self.landmarks):
+            self._move_constants(self._landmarks_seen() - before)
+
+    def _landmarks_seen(self) -> FloatArray:
+        """Landmarks (M, 3) from the newest camera's centre, along the world's axes."""
+        T = self.T_cam0_world(-1)[0]
+        return self.landmarks + T[:3, :3].T @ T[:3, 3]
+
+    def _move_constants(self, moved: FloatArray) -> None:
+        """Let how landmarks depend on baseline and focal length follow their means, equation (S5).
+
+        A world that is scaled with the baseline changes no pixel. Where landmarks depend on it as
+        at their means before, their pixels would say something of the constants all the same, and
+        an IMU, which forgets nothing, turns that into tilt and velocity.
+
+        Args:
+            moved: by how much landmarks (M, 3) have moved against the newest camera.
+        """
+        rows = self.state.landmarks
+        V = self.prior.error_D_constants
+        V[rows, 1] += moved.reshape(-1)
+        axis = self.T_cam0_world(-1)[0, 2, :3]
+        V[rows, 2] += np.outer(moved @ axis, axis).reshape(-1)
 
     def turn_world(self, yaw: float, yaw_D_tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Turn the whole world about its z axis, and let the errors' yaw hang on the present tilt,
