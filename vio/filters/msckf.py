@@ -11,6 +11,7 @@ algorithm for improving consistency (2017); Barrau & Bonnabel (2017).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -132,6 +133,13 @@ class Msckf(Backend):
         if self._source == "velocity" and self._window is not None:
             self._propagation.advance(self._window, sample.time_ns)
             self._measure()
+
+    def propagate_all(self, samples: Sequence[MotionSample]) -> None:
+        """Take motion samples, see `propagate`."""
+        if self._source == "imu" and self._order.accept_imu(samples):
+            self._propagation.take_imu(samples)
+        else:  # a velocity moves the state at once, and what is wrong is named by its own sample
+            super().propagate_all(samples)
 
     def take_rotation_comparison(self, comparison: RotationComparison | None) -> None:
         """Take how the camera's rotation compares with the gyro's; None: they were not compared

@@ -158,6 +158,10 @@ class ImuMotion:
         assert isinstance(sample, ImuSample)
         self._new.append(sample)
 
+    def take_all(self, samples: Sequence[ImuSample]) -> None:
+        """Keep samples, see `take`."""
+        self._new += samples
+
     @property
     def samples(self) -> Sequence[ImuSample]:
         """The samples that are kept, in order of time; new ones are checked here, all since the
@@ -300,7 +304,9 @@ class ImuMotion:
         """Drop the samples that no interval from this time on needs."""
         samples = self.samples
         keep = 0
-        while keep + 1 < len(samples) and samples[keep + 1].time_ns <= time_ns:
+        for sample in samples[1:]:
+            if sample.time_ns > time_ns:
+                break
             keep += 1
         if keep and len(self._chosen):
             seconds = (samples[keep].time_ns - samples[0].time_ns) * 1e-9

@@ -4,6 +4,8 @@ motion.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from vio.dataclass import dataclass
@@ -22,7 +24,7 @@ from vio.filters.online_calibration import NO_TWIST, Twist, body_twist, walk_var
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
-from vio.records import MotionPrior, MotionSample, MotionSource
+from vio.records import ImuSample, MotionPrior, MotionSample, MotionSource
 
 # Factors on the motion model's densities: at the start, at least, at most.
 IMU_FACTORS = (1.0, 1.0, 50.0)
@@ -154,6 +156,12 @@ class Propagation:
     def take(self, sample: MotionSample) -> None:
         """Take a motion sample, which may change what the next step looks like."""
         self.motion.take(sample)
+        self._coming = None
+
+    def take_imu(self, samples: Sequence[ImuSample]) -> None:
+        """Take samples of an IMU at once, see `take`."""
+        assert isinstance(self.motion, ImuMotion)
+        self.motion.take_all(samples)
         self._coming = None
 
     def advance(self, window: Window, time_ns: int) -> None:

@@ -13,6 +13,7 @@ prediction agrees, and they are used.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -72,7 +73,7 @@ class FrozenImages:
     """Compares each pair with the last one that showed something new."""
 
     def __init__(self) -> None:
-        self._imu: deque[ImuSample] = deque()
+        self._imu: list[ImuSample] = []  # the last half second
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
         self._seen: Observations | None = None  # its features
         self._seen_before: Observations | None = None  # those of the frame before
@@ -87,11 +88,15 @@ class FrozenImages:
         # median error of each frame's predicted pixels
         self._errors_px: deque[float] = deque(maxlen=_RECENT)
 
-    def sample(self, sample: ImuSample) -> None:
-        """Take a sample of the IMU."""
-        self._imu.append(sample)
-        while (sample.time_ns - self._imu[0].time_ns) * S_PER_NS > STANDSTILL_S:
-            self._imu.popleft()
+    def samples(self, samples: Sequence[ImuSample]) -> None:
+        """Take samples of the IMU."""
+        self._imu += samples
+        old = 0
+        for sample in self._imu:
+            if (self._imu[-1].time_ns - sample.time_ns) * S_PER_NS <= STANDSTILL_S:
+                break
+            old += 1
+        del self._imu[:old]
 
     def observations(self, seen: Observations) -> None:
         """Take the features of a frame that `check` let pass."""
