@@ -360,7 +360,7 @@ def spread_evenly(
     distance = min_distance_px(width, height, grid)
     near = np.empty(len(points), dtype=np.bool_)
     _near_others(points, occupied, distance, near)
-    candidates = np.flatnonzero(~near)
+    candidates = (~near).nonzero()[0]
     shape = grid_shape(width, height, grid)
     cell, held = (cell_index(uv, width, height, shape) for uv in (points[candidates], occupied))
     level = _filling(cell, held, shape[0] * shape[1])

@@ -249,7 +249,7 @@ def merge_events(
     with contextlib.closing(frames):
         for frame in frames:
             until = int(samples.times_ns.searchsorted(frame.time_ns, side="right"))
-            yield from samples.take(slice(given, until)).records()
+            yield from samples.records(slice(given, until))
             given = max(given, until)
             yield frame
     yield from samples.take(slice(given, None))

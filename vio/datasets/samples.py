@@ -58,15 +58,15 @@ class MotionSamples(Sequence[Sample_co]):
 
     def __iter__(self) -> Iterator[Sample_co]:
         for k in range(0, len(self), _CHUNK):
-            yield from self.take(slice(k, k + _CHUNK)).records()
+            yield from self.records(slice(k, k + _CHUNK))
 
-    def records(self) -> list[Sample_co]:
-        """Return a record of each sample."""
+    def records(self, rows: slice) -> list[Sample_co]:
+        """Return a record of each of some samples."""
         columns = (
-            self.times_ns.tolist(),
-            self.values[:, :3],
-            self.values[:, 3:],
-            self.is_imu.tolist(),
+            self.times_ns[rows].tolist(),
+            self.values[rows, :3],
+            self.values[rows, 3:],
+            self.is_imu[rows].tolist(),
         )
         made: list[Any] = [
             (ImuSample if is_imu else VelocitySample)(time_ns, first, second)

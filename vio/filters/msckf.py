@@ -36,7 +36,15 @@ from vio.filters.restart import GoodState, as_good_state, required, restarted
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Clone, Window
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, so3_exp, so3_log
+from vio.geometry.lie import (
+    FloatArray,
+    length,
+    se3_adjoint,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+    so3_log,
+)
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.geometry.upright import nearest_yaw
@@ -515,4 +523,4 @@ def _is_sane(window: Window, source: MotionSource | None) -> bool:
     """Whether the state is made of numbers, and with an IMU of a possible speed."""
     if not np.isfinite(window.prior.P).all() or not np.isfinite(window.nav.T_world_imu).all():
         return False
-    return source != "imu" or float(np.linalg.norm(window.nav.velocity)) < _MAX_SPEED_MPS
+    return source != "imu" or length(window.nav.velocity) < _MAX_SPEED_MPS

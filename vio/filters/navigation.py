@@ -122,6 +122,7 @@ class Growth:
         return Growth(Phi @ self.Phi, Q, Q_parts, self.bridged or step.bridged, Phi_imu)
 
 
+_I3 = np.eye(3)
 NO_STEP = Growth(np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM)))
 
 
@@ -258,7 +259,7 @@ class ImuMotion:
         v = nav.velocity.copy()
         turned = np.zeros(3)
         total = float(times[-1]) * 1e-9
-        Phi = np.eye(DIM)
+        Phi = NO_STEP.Phi.copy()
         Q_parts = np.zeros((2, DIM, DIM))
         Q = np.empty((DIM, DIM))
         bias = np.concatenate([nav.gyro_bias, nav.accel_bias])
@@ -293,7 +294,7 @@ class ImuMotion:
         terms.
         """
         out = np.zeros((3, DIM + len(self._chosen)))
-        out[:, 9:12] = -np.eye(3)
+        out[:, 9:12] = -_I3
         if len(self._chosen):
             out[:, DIM:] = gyro_D_terms(raw_rate(nav.rate + nav.gyro_bias, nav.imu_terms))[
                 :, self._chosen

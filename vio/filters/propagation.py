@@ -92,6 +92,8 @@ class _Coming:
     growth: Growth  # since the last frame, with it
 
 
+_I3 = np.eye(3)
+_POSE = np.eye(6, DIM)  # the pose of a navigation state
 _NOTHING = FramePosterior(np.zeros((DIM, DIM)), np.zeros((DIM + 6, DIM + 6)), np.eye(4))
 
 
@@ -256,7 +258,7 @@ class Propagation:
         if last is None or last[0] is not nav or last[1] is not growth or last[2] != late_s:
             T, J = window.camera_at(late_s, twist, nav)
             if not window.calibration.moves_camera and "imu_terms" not in window.state:
-                M = growth.Phi[:6] - np.eye(6, DIM)
+                M = growth.Phi[:6] - _POSE
                 moved = M @ self.posterior.own[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
             else:
                 M = np.concatenate([J @ self.grown(window, nav, growth), -np.eye(6)], axis=1)
@@ -288,7 +290,7 @@ class Propagation:
         covariance = np.zeros((6, 6))
         # v = exp(phi) v_hat + xi_v, seen from the body turned by phi
         covariance[:3, :3] = R.T @ P[6:9, 6:9] @ R
-        by_gyro = np.eye(3) * self.motion.rate_variance(self.noise.factors)
+        by_gyro = _I3 * self.motion.rate_variance(self.noise.factors)
         covariance[3:, 3:] = rate_D_error @ P @ rate_D_error.T + by_gyro
         twist = Twist(body_twist(nav.T_world_imu, nav.velocity, nav.rate), covariance)
         self._twist = nav, growth, twist

@@ -37,7 +37,7 @@ class TrackTable:
         rows: IntArray = np.empty(len(seen), dtype=np.int64)
         new = loops.find_rows(seen.ids, self._ids[self._rows], self._rows, rows)
         if new:
-            unknown = np.flatnonzero(rows < 0)
+            unknown = (rows < 0).nonzero()[0]
             while new > len(self._free):
                 self._grow(2 * len(self._ids))
             rows[unknown] = self._free[-1 : -new - 1 : -1]

@@ -22,7 +22,7 @@ from vio.geometry.lie import FloatArray, se3_log
 from vio.imu.standstill import STANDSTILL_S, blocks_agree
 from vio.numerics.compiled import compiled
 from vio.numerics.robust import median
-from vio.numerics.statistics import chi_square_quantile
+from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import (
     S_PER_NS,
     Image,
@@ -214,8 +214,7 @@ class FrozenImages:
             return False
         xi = se3_log(motion.T_curr_prev)
         C = motion.covariance
-        scale = float(np.trace(C)) + 1e-18
-        return bool(xi @ np.linalg.solve(C + 1e-9 * scale * np.eye(6), xi) > _LIMIT)
+        return squared_distance(xi, C, 1e-9 * (float(C.trace()) + 1e-18)) > _LIMIT
 
 
 def _equal(a: Image, b: Image) -> bool:
