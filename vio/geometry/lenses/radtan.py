@@ -145,7 +145,8 @@ def undistort(c: Coefficients, target: FloatArray) -> tuple[FloatArray, BoolArra
     xy = np.where(np.isfinite(target), target, 0.0)
     goal = xy
     for _ in range(_NEWTON_STEPS):
-        residual = distort(c, xy) - goal
+        now = distort(c, xy)
+        residual = now - goal
         if np.abs(residual).max(initial=0.0) < _NEWTON_TOLERANCE:
             break
         J = distort_by_xy(c, xy)
@@ -155,7 +156,9 @@ def undistort(c: Coefficients, target: FloatArray) -> tuple[FloatArray, BoolArra
         step[..., 0] = J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1]
         step[..., 1] = J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]
         xy = xy - np.minimum(np.maximum(step / det[..., None], -0.5), 0.5)
-    found = _radius(distort(c, xy) - target) < 1e-8
+    else:
+        now = distort(c, xy)
+    found = _radius(now - target) < 1e-8
     return xy, np.logical_and(found, _radius(xy) < max_radius(c))
 
 
