@@ -141,7 +141,7 @@ class WindowPosterior:
         A = se3_adjoint(T_old_world)
         C = A @ (self.P[a, a] + self.P[b, b] - self.P[a, b] - self.P[b, a]) @ A.T
         limit = _STATIONARY_LIMIT  # no eigenvalue of C is larger than its trace
-        most = float(np.trace(C)) + 6e-18
+        most = float(C.trace()) + 6e-18
         moved = new.T_world_imu[:3, 3] - old.T_world_imu[:3, 3]
         if float(moved @ moved) > limit * most:  # rho is no shorter, as |J_l(phi) rho| <= |rho|
             return False

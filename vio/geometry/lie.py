@@ -78,6 +78,13 @@ def length(vector: FloatArray) -> float:
     return math.sqrt(vector.dot(vector))
 
 
+def lengths(vectors: FloatArray) -> FloatArray:
+    """Lengths (N,) of vectors of the plane (N, 2)."""
+    x = vectors[:, 0]
+    y = vectors[:, 1]
+    return np.sqrt(x * x + y * y)
+
+
 def _series(x: float, y: float, z: float, b: float, c: float) -> FloatArray:
     """`I + b W + c W W` (3, 3) with W the skew-symmetric matrix of a vector."""
     xx = c * x * x

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vio.dataclass import dataclass
-from vio.geometry.lie import FloatArray, se3_log
+from vio.geometry.lie import FloatArray, lengths, se3_log
 from vio.imu.standstill import STANDSTILL_S, blocks_agree
 from vio.numerics.compiled import compiled
 from vio.numerics.robust import median
@@ -229,7 +229,7 @@ def _moved(before: Observations, now: Observations | TrackPrior) -> tuple[IntArr
     differ in the left image.
     """
     a, b = shared_rows(before.ids, now.ids)
-    return a, np.asarray(np.linalg.norm(now.z[b, :2] - before.z[a, :2], axis=1))
+    return a, lengths(now.z[b, :2] - before.z[a, :2])
 
 
 def _median_flow_px(before: Observations, now: Observations) -> float:
@@ -261,7 +261,7 @@ def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
     of_images = seen.z[:_CORNERS, :2], seen.z[seen.has_right][:_CORNERS, 2:]
     for old, new, pixels in zip(_images(before), _images(now), of_images, strict=False):
         flow = corner_flow(old, new, pixels)
-        if len(flow) < _MIN_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
+        if len(flow) < _MIN_CORNERS or (lengths(flow) < _UNMOVED_PX).mean() < _SHARE:
             return False
     return True
 

@@ -4,6 +4,7 @@ each event is one line.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -245,7 +246,7 @@ class RunHealth:
 
 def _position_sigma(estimate: Estimate) -> float:
     """Standard deviation of the position, m."""
-    return float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+    return math.sqrt(estimate.covariance[:3, :3].trace())
 
 
 _SPAN_S = 1.0
