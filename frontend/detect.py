@@ -279,7 +279,7 @@ def detect_corners(
     level = _filling(
         cell[rows], cell_index(occupied, 2 * width, 2 * height, shape), shape[0] * shape[1]
     )
-    order = np.argsort(level, kind="stable")
+    order = level.argsort(kind="stable")
     chosen = corners[rows[order[level[order] < 2 * _CELL_FEATURES][:wanted]]]
     peaks = np.empty((len(chosen), 2))
     _refine_peaks(response, chosen, peaks)
@@ -360,11 +360,11 @@ def spread_evenly(
     distance = min_distance_px(width, height, grid)
     near = np.empty(len(points), dtype=np.bool_)
     _near_others(points, occupied, distance, near)
-    candidates = np.flatnonzero(~near)
+    candidates = (~near).nonzero()[0]
     shape = grid_shape(width, height, grid)
     cell, held = (cell_index(uv, width, height, shape) for uv in (points[candidates], occupied))
     level = _filling(cell, held, shape[0] * shape[1])
-    return candidates[np.argsort(level, kind="stable")[:wanted]]
+    return candidates[level.argsort(kind="stable")[:wanted]]
 
 
 @compiled

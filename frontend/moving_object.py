@@ -39,7 +39,7 @@ from vio.frontend.outliers import (
 )
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
-from vio.numerics.statistics import chi_square_quantile
+from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import BoolArray, IntArray, MotionPrior
 
 Decision: TypeAlias = Literal["predicted", "voted", "undecided", "unsupported"]
@@ -119,7 +119,7 @@ def choose_motion(
         voted = _voted(problem, p_prev, pixels, found, voting)
         if voted is not None and not _prediction_overrules(p_prev, found, voted, expected):
             return TwoMotions(voted, _if_large((found.inliers & ~voted.inliers).mean()), "voted")
-    others = np.flatnonzero(~found.inliers)
+    others = (~found.inliers).nonzero()[0]
     least = max(_MIN_POINTS, _MIN_SUPPORT * found.inliers.sum())
     of_first = np.inf
     is_far = expected is not None and expected.is_beyond(found.T_curr_prev, _LIMIT)
@@ -473,7 +473,7 @@ class _Expected:
 
     def _distance(self, T: FloatArray, covariance: FloatArray) -> float:
         xi = se3_log(T @ se3_inverse(self.prior.T_curr_prev))
-        return float(xi @ np.linalg.solve(covariance, xi))
+        return squared_distance(xi, covariance, 0.0)
 
 
 def _pixel_D_motion(camera: StereoCamera, p: FloatArray) -> FloatArray:

@@ -76,9 +76,7 @@ class NewFeatures:
         new = changed(new, left_only_frames=np.where(new.has_right, 0, 1))
         room = max(0, self._grid.target_features - len(tracks))
         good = (new.has_right | (len(chosen) > with_depth)).nonzero()[0]
-        return joined(
-            tracks, take(new, good[np.argsort(~new.has_right[good], kind="stable")][:room])
-        )
+        return joined(tracks, take(new, good[(~new.has_right[good]).argsort(kind="stable")][:room]))
 
     def _search_right(
         self,

@@ -153,7 +153,7 @@ class RightMatcher:
         """
         delay = self._delay.frames
         then = stereo.track_right(at_exposure(tracks, flow, T, delay), right, True)
-        rows = np.flatnonzero(~then.has_right & ~then.has_point)
+        rows = (~then.has_right & ~then.has_point).nonzero()[0]
         disparity, unique = stereo.search(
             previous.left.half, right.half, (tracks.left - flow)[rows]
         )

@@ -504,7 +504,7 @@ def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:
     what is left.
     Reference: Tukey, Exploratory Data Analysis (1977), resistant lines.
     """
-    order = np.argsort(expected)
+    order = expected.argsort()
     near = order[len(order) // 2 :]
     far = order[: len(order) // 2]
     d_near = median(expected[near])

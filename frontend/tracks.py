@@ -86,10 +86,10 @@ class AnchorBank:
 
     def add(self, image: Image, centres: FloatArray) -> IntArray:
         """Cut new anchors around pixels (N, 2) of an image; return their slots (N,)."""
-        free = np.flatnonzero(~self._taken)[: len(centres)]
+        free = (~self._taken).nonzero()[0][: len(centres)]
         if len(free) < len(centres):
             self._grow(len(self._taken) + len(centres))
-            free = np.flatnonzero(~self._taken)[: len(centres)]
+            free = (~self._taken).nonzero()[0][: len(centres)]
         self._taken[free] = True
         self.store.sigma[free] = 0.0
         self.replace(free, image, centres)

@@ -128,7 +128,7 @@ class Folders:
         request = dict.fromkeys(("reference", "lengths_m", "save_calibration", "map", "command"))
         request |= {"map_density": None, "start": 0, "stop": _FRAMES, "source": f"log:{self._log}"}
         request |= {"save_observations": True, "localise": False, "plot": False}
-        left = [150]  # events: some frames
+        left = [4]  # frames
 
         def stops() -> str | None:
             left[0] -= 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
 from vio.errors import EstimationError
@@ -187,6 +187,11 @@ class Backend(Protocol):
     @abstractmethod
     def propagate(self, sample: MotionSample) -> None:
         """Take one motion sample; samples come in time order."""
+
+    def propagate_all(self, samples: Sequence[MotionSample]) -> None:
+        """Take motion samples as `propagate` takes them one by one: those before the next frame."""
+        for sample in samples:
+            self.propagate(sample)
 
     @abstractmethod
     def update(self, observations: Observations) -> UpdateReport:

@@ -254,3 +254,18 @@ def test_front_ends_refuse_wrong_parts() -> None:
             ConfigError, match="build_frontend takes a StereoCamera and FrontendSettings"
         ):
             build_frontend("klt", camera, settings, None)  # type: ignore[arg-type]
+
+
+def test_samples_at_once_are_taken_as_one_by_one_and_a_wrong_one_is_named() -> None:
+    at_once = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion="imu")
+    good = [ImuSample(k, np.zeros(3), REST) for k in (10, 20, 30)]
+    at_once.propagate_all(good[:2])
+    with pytest.raises(DataError, match="at 20 ns is not after the last one"):
+        at_once.propagate_all([good[2], good[1]])
+    with pytest.raises(DataError, match="at 40 ns holds"):
+        at_once.propagate_all([ImuSample(40, np.array([np.nan, 0.0, 0.0]), REST)])
+    with pytest.raises(ConfigError, match="got a VelocitySample"):
+        at_once.propagate_all([VelocitySample(50, np.zeros(3), np.zeros(3))])
+    at_once.propagate_all([ImuSample(31, np.zeros(3), REST)])  # all before the wrong one were taken
+    with pytest.raises(DataError, match="at 31 ns is not after the last one"):
+        at_once.propagate_all([ImuSample(31, np.zeros(3), REST)])

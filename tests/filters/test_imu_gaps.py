@@ -4,6 +4,7 @@ late or ends early.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
@@ -21,7 +22,7 @@ from vio.filters.msckf import Msckf
 from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log
-from vio.live.processor import EventOrder
+from vio.live.processor import Due, EventOrder
 from vio.monitor.run import RunMonitor
 from vio.records import Event, ImuSample, StereoFrame, UpdateReport, VelocitySample
 
@@ -45,7 +46,11 @@ def _order(events: list[Event]) -> list[int]:
 
 def _ordered(events: list[Event]) -> list[Event]:
     order = EventOrder(wait_for_imu=True)
-    return [ready for event in events for ready in order.add(event)] + order.flush()
+    return [e for event in events for e in _listed(order.add(event))] + _listed(order.flush())
+
+
+def _listed(due: Iterable[Due]) -> list[Event]:
+    return [e for step in due for e in (*step.samples, step.frame) if e is not None]
 
 
 def test_a_frame_waits_for_the_sample_after_it() -> None:
@@ -57,10 +62,10 @@ def test_a_frame_waits_for_the_sample_after_it() -> None:
 def test_a_frame_waits_for_the_sample_after_its_exposure_by_the_estimated_offset() -> None:
     order = EventOrder(wait_for_imu=True)
     order.exposed_after_ns = 12
-    assert [e.time_ns for k in (10, 20, 30) for e in order.add(_sample(k))] == []
-    assert [e.time_ns for e in order.add(_frame(1, 15))] == [10, 20, 30, 15]
+    assert [e.time_ns for k in (10, 20, 30) for e in _listed(order.add(_sample(k)))] == []
+    assert [e.time_ns for e in _listed(order.add(_frame(1, 15)))] == [10, 20, 30, 15]
     assert list(order.add(_frame(2, 19))) == []
-    assert [e.time_ns for e in order.add(_sample(40))] == [40, 19]
+    assert [e.time_ns for e in _listed(order.add(_sample(40)))] == [40, 19]
 
 
 def test_a_frame_waits_until_one_a_tenth_of_a_second_newer_has_come() -> None:
@@ -72,6 +77,21 @@ def test_a_frame_waits_until_one_a_tenth_of_a_second_newer_has_come() -> None:
     assert _order([*early, _frame(4, 105 * ms), _sample(110 * ms)]) == [-1, 110 * ms, -2, -3, -4]
 
 
+def test_samples_at_once_are_released_as_one_by_one() -> None:
+    samples = [_sample(k) for k in (10, 20, 30, 40, 50)]
+    together = EventOrder(wait_for_imu=True)
+    together.exposed_after_ns = 12
+    held = [*together.add(_frame(1, 15)), *together.add(_frame(2, 33))]
+    assert held == []
+    found = _listed(together.add_samples(samples)) + _listed(together.flush())
+    alone = EventOrder(wait_for_imu=True)
+    alone.exposed_after_ns = 12
+    events = [_frame(1, 15), _frame(2, 33), *samples]
+    expected = [e for event in events for e in _listed(alone.add(event))] + _listed(alone.flush())
+    times = [10, 20, 30, 15, 40, 50, 33]
+    assert [e.time_ns for e in found] == [e.time_ns for e in expected] == times
+
+
 def test_a_frame_waits_no_longer_than_to_the_end() -> None:
     assert _order([_sample(1), _frame(1, 5), _frame(2, 15)]) == [1, -1, -2]
 
@@ -79,15 +99,16 @@ def test_a_frame_waits_no_longer_than_to_the_end() -> None:
 def test_a_frame_with_a_sample_at_its_own_time_does_not_wait() -> None:
     order = EventOrder(wait_for_imu=True)
     assert list(order.add(_sample(10))) == []
-    assert [type(event) for event in order.add(_frame(1, 10))] == [ImuSample, StereoFrame]
+    due = _listed(order.add(_frame(1, 10)))
+    assert [type(event) for event in due] == [ImuSample, StereoFrame]
 
 
 def test_without_an_imu_a_frame_passes_at_once() -> None:
     order = EventOrder(wait_for_imu=False)
     velocities = [VelocitySample(k, np.zeros(3), np.zeros(3)) for k in (10, 15, 20)]
     assert [list(order.add(velocity)) for velocity in velocities] == [[], [], []]
-    assert list(order.add(frame := _frame(1, 15))) == [*velocities[:2], frame]
-    assert order.flush() == velocities[2:]
+    assert _listed(order.add(frame := _frame(1, 15))) == [*velocities[:2], frame]
+    assert _listed(order.flush()) == velocities[2:]
 
 
 @given(st.integers(-90, 90))
@@ -284,7 +305,7 @@ def _lines(times_s: list[float], frames_s: list[float]) -> list[str]:
                 replace(flight.observe(0, 0.5, rng), frame_index=event.index, time_ns=event.time_ns)
             )
         else:
-            monitor.sample(event)
+            monitor.samples([event])
     monitor.close()
     return [line for line in monitor.lines if line.startswith(("frame", "no IMU"))]
 

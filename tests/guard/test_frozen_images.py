@@ -92,7 +92,7 @@ def _watching(*, shaking: bool = True, off_px: float = 0.1) -> FrozenImages:
     for k in range(200):
         turn = np.array([0.0, 0.4 * np.sin(0.05 * k) if shaking else 0.0, 0.0])
         gyro, accel = turn + rng.normal(0, 3e-3, 3), np.array([0, 0, 9.81]) + rng.normal(0, 0.15, 3)
-        frozen.sample(ImuSample(k * 5_000_000 - 950_000_000, gyro, accel))
+        frozen.samples([ImuSample(k * 5_000_000 - 950_000_000, gyro, accel)])
     return frozen
 
 

@@ -138,7 +138,7 @@ def test_a_run_goes_on_to_the_same_map(flight: Path, mapped: Path, tmp_path: Pat
         open_dataset(flight),
         Config(),
         map=MapUse(path),
-        control=RunControl(folder, should_stop=Stop(300)),
+        control=RunControl(folder, should_stop=Stop(10)),
     )
     assert 5 < len(first.frames) < 20
     second = run(

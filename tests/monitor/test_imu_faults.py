@@ -216,12 +216,11 @@ def _lines(samples: list[ImuSample]) -> list[str]:
         *(StereoFrame(k, k * 50_000_000, None, None) for k in range(FRAMES)),
     ]
     order = EventOrder(wait_for_imu=True)
-    ready = [e for event in sorted(events, key=lambda e: e.time_ns) for e in order.add(event)]
-    for event in [*ready, *order.flush()]:
-        if isinstance(event, StereoFrame):
-            monitor.observations(flight.observe(event.index, 0.1, rng))
-        else:
-            monitor.sample(event)
+    ready = [d for event in sorted(events, key=lambda e: e.time_ns) for d in order.add(event)]
+    for due in [*ready, *order.flush()]:
+        monitor.samples(due.samples)
+        if due.frame is not None:
+            monitor.observations(flight.observe(due.frame.index, 0.1, rng))
     monitor.close()
     return monitor.lines
 
@@ -304,7 +303,8 @@ def test_a_simulator_without_noise_is_not_saturated(kind: str) -> None:
         gyro = np.array([0.0, 0.0, 0.5 * ramp])
         if kind == "turn while it sways":
             gyro[:2] = moving * 0.2 * np.sin(0.01 * (k - 200)) ** 2
-        samples.add(ImuSample(k * 5_000_000, gyro, np.array([0.1 * ramp, 0.0, 9.81])))
+        force = np.array([0.1 * ramp, 0.0, 9.81])
+        samples.add([ImuSample(k * 5_000_000, gyro, force)])
     assert samples.check_new(keep=True) == []
 
 
@@ -315,7 +315,7 @@ def test_a_range_that_ends_is_still_named() -> None:
         clipped = float(np.clip(6 * np.sin(0.02 * k), -4, 4))
         gyro = np.array([clipped, *rng.normal(0, 1e-3, 2)])
         force = np.array([0, 0, 9.81]) + rng.normal(0, 0.01, 3)
-        samples.add(ImuSample(k * 5_000_000, gyro, force))
+        samples.add([ImuSample(k * 5_000_000, gyro, force)])
     assert [f.fault for f in samples.check_new(keep=True)] == ["saturation"]
 
 

@@ -147,7 +147,7 @@ def _checked(
     found: list[InertialFinding] = []
     for event in events:
         if isinstance(event, ImuSample):
-            check.imu(event)
+            check.imu([event])
         else:
             found += check.frame(event)
     return check, [*found, *check.finish()]
@@ -341,7 +341,7 @@ def test_a_run_blames_the_baseline_only_once_the_accelerometers_axes_are_right(
         [*(_CORRUPTED[name][0](it) if name else it.samples), *it.frames], key=lambda e: e.time_ns
     ):
         if isinstance(event, ImuSample):
-            monitor.sample(event)
+            monitor.samples([event])
             continue
         monitor.observations(event)
         used = UpdateReport(50, 2, 1, 30, 0.3, 1.0)
@@ -371,7 +371,7 @@ def test_the_filter_judges_no_baseline_by_an_imu_that_looks_faulty(name: str, at
     agree = []
     for event in sorted([*samples, *it.frames[: at + 60]], key=lambda e: e.time_ns):
         if isinstance(event, ImuSample):
-            monitor.sample(event)
+            monitor.samples([event])
         else:
             monitor.observations(event)
             agree.append(
@@ -485,7 +485,7 @@ def test_reports_missing_samples_before_a_filter_fails() -> None:
     assert check.finish() == ()
     check = InertialCheck(it.camera, it.T_cam0_imu)
     for sample in it.samples[:100]:
-        check.imu(sample)
+        check.imu([sample])
     late = [replace(f, time_ns=f.time_ns + 10**15) for f in it.frames[:12]]
     found = [f for seen in late for f in check.frame(seen)]
     assert _faults(found) == ["clocks without overlap"]
@@ -569,9 +569,8 @@ def test_check_ends_and_can_be_reset() -> None:
         samples = iter(it.samples)
         for seen in it.frames:
             for sample in samples:
-                check.imu(
-                    replace(sample, gyro=corrupt * sample.gyro, time_ns=sample.time_ns + shift_ns)
-                )
+                shifted_ns = sample.time_ns + shift_ns
+                check.imu([replace(sample, gyro=corrupt * sample.gyro, time_ns=shifted_ns)])
                 if sample.time_ns >= seen.time_ns:
                     break
             found += check.frame(replace(seen, time_ns=seen.time_ns + shift_ns))
@@ -595,7 +594,8 @@ def test_memory_is_bounded() -> None:
     check = InertialCheck(it.camera, it.T_cam0_imu)
     for k in range(80 * 20):
         for j in range(10):
-            check.imu(ImuSample(k * _FRAME_NS + j * 5_000_000, np.zeros(3), np.array([9.81, 0, 0])))
+            time_ns = k * _FRAME_NS + j * 5_000_000
+            check.imu([ImuSample(time_ns, np.zeros(3), np.array([9.81, 0, 0]))])
         seen = it.frames[0]
         check.frame(replace(seen, frame_index=k, time_ns=k * _FRAME_NS + 45_000_000))
     times_ns, _ = check._samples.table()

@@ -65,7 +65,7 @@ def stopped_folder(recording: Path) -> Path:
         "command": None,
     }
     folder = growing_folder(out, dataset, Config(), request)
-    control = RunControl(folder, should_stop=Stop(80))
+    control = RunControl(folder, should_stop=Stop(8))
     assert run(dataset, Config(), keep_observations=True, control=control).stopped is not None
     return out
 

@@ -106,7 +106,7 @@ def test_a_table_in_memory_is_the_same() -> None:
 
 
 class Stop:
-    """Asks to stop after a number of events."""
+    """Asks to stop after a number of frames."""
 
     def __init__(self, after: int) -> None:
         self.left = after
@@ -171,22 +171,22 @@ def _assert_same(a: RunResult, b: RunResult) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "config", "events"),
+    ("make", "config", "frames"),
     [
-        (lambda log: open_dataset(log), Config(), 300),
-        (lambda log: open_dataset(log), replace(Config(), lag_frames=4), 411),
+        (lambda log: open_dataset(log), Config(), 10),
+        (lambda log: open_dataset(log), replace(Config(), lag_frames=4), 20),
         (
             lambda log: open_dataset(log),
             replace(Config(), dataset=DatasetSettings(max_frame_rate=10.0)),
-            300,
+            20,
         ),
-        (lambda log: FakeDrive(), Config(), 29),
-        (lambda log: _rendered(), Config(), 150),
+        (lambda log: FakeDrive(), Config(), 14),
+        (lambda log: _rendered(), Config(), 8),
     ],
     ids=["features and imu", "lag", "frame rate", "velocities", "images"],
 )
 def test_a_run_goes_on_to_the_same_bits(
-    flight_log: Path, tmp_path: Path, make: Callable[[Path], Dataset], config: Config, events: int
+    flight_log: Path, tmp_path: Path, make: Callable[[Path], Dataset], config: Config, frames: int
 ) -> None:
     whole = run(make(flight_log), config, keep_observations=True)
     folder = GrowingFolder(tmp_path / "run", {})
@@ -194,7 +194,7 @@ def test_a_run_goes_on_to_the_same_bits(
         make(flight_log),
         config,
         keep_observations=True,
-        control=RunControl(folder, should_stop=Stop(events)),
+        control=RunControl(folder, should_stop=Stop(frames)),
     )
     assert first.stopped == "interrupted"
     assert 5 < len(first.frames) < len(whole.frames)
@@ -215,7 +215,7 @@ def test_a_run_with_opencv_s_features_goes_on_to_the_same_bits(name: str, tmp_pa
     config = replace(Config(), frontend=replace(Config().frontend, name=name))
     whole = run(_rendered(), config, keep_observations=True)
     folder = GrowingFolder(tmp_path / "run", {})
-    stop = RunControl(folder, should_stop=Stop(120))
+    stop = RunControl(folder, should_stop=Stop(7))
     first = run(_rendered(), config, keep_observations=True, control=stop)
     assert 5 < len(first.frames) < len(whole.frames)
     go_on = RunControl(folder, resume=True)
@@ -256,7 +256,7 @@ def test_a_checkpoint_does_not_wait_for_an_imu_that_begins_late(
 
 
 def test_a_run_in_memory_that_is_stopped_keeps_its_map(flight_log: Path) -> None:
-    stopped = run(open_dataset(flight_log), Config(), control=RunControl(should_stop=Stop(400)))
+    stopped = run(open_dataset(flight_log), Config(), control=RunControl(should_stop=Stop(19)))
     same = run(open_dataset(flight_log), Config(), stop=len(stopped.frames))
     np.testing.assert_array_equal(stopped.landmarks.ids, same.landmarks.ids)
 
@@ -471,7 +471,7 @@ def interrupted(flight_log: Path, tmp_path_factory: pytest.TempPathFactory) -> t
         save_observations=True,
     )
     folder = growing_folder(place / "run", dataset, config, request.values())
-    run(dataset, config, keep_observations=True, control=RunControl(folder, should_stop=Stop(300)))
+    run(dataset, config, keep_observations=True, control=RunControl(folder, should_stop=Stop(10)))
     shutil.copytree(place, kept)
     return place, kept
 
@@ -566,12 +566,12 @@ def test_a_run_that_dies_after_its_checkpoint_goes_on_with_estimates_that_were_s
     # as known at the end, as are the poses
     np.testing.assert_array_equal(gravity, gravity[-1:].repeat(4, axis=0))
     assert np.isfinite(gravity).all()
-    stop = Stop(350)
+    stop = Stop(15)
 
     def died() -> str | None:
-        if stop.left == 50:
+        if stop.left == 6:
             monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.0)
-        if stop.left == 49:
+        if stop.left == 5:
             monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 1e9)
         if stop() is not None:
             raise RuntimeError("died")

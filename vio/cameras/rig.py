@@ -33,7 +33,7 @@ from vio.geometry.rectify import (
 from vio.geometry.stereo import StereoCamera, one_camera
 from vio.records import Image, ImuDensities, StereoFrame
 
-_PARTS = 32  # of a pixel, in which OpenCV's remap counts
+_BITS = 5  # of the parts of a pixel, 32, in which OpenCV's remap counts
 # Standard deviation of a virtual disparity over that of the pixels of a track, which are those of
 # two exposures.
 _DISPARITY_SIGMAS = 2**0.5
@@ -158,9 +158,12 @@ def fixed_point(maps: tuple[MapArray, MapArray]) -> LookUp:
     That is whole pixels (H, W, 2) int16, and the rest (H, W) uint16 in parts of a pixel,
     `32 v + u`.
     """
-    u, v = (np.rint(m * np.float32(_PARTS)).astype(np.int32) for m in maps)
-    whole = np.stack([u // _PARTS, v // _PARTS], axis=-1).astype(np.int16)
-    return whole, (v % _PARTS * _PARTS + u % _PARTS).astype(np.uint16)
+    u, v = (np.rint(m * np.float32(1 << _BITS)).astype(np.int32) for m in maps)
+    whole = np.empty((*u.shape, 2), dtype=np.int16)
+    whole[..., 0] = u >> _BITS
+    whole[..., 1] = v >> _BITS
+    part = (1 << _BITS) - 1
+    return whole, ((v & part) << _BITS | u & part).astype(np.uint16)
 
 
 def remap(image: Image, maps: LookUp, interpolation: Interpolation) -> Image:

@@ -8,10 +8,13 @@ import math
 import sys
 import time
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from vio.errors import NOTE
 from vio.files.printable import json_text, printable
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +39,13 @@ def print_result(
     return 0
 
 
+def _shown(label: str, total: int | None, unit: str) -> tqdm[NoReturn]:
+    """Show a bar on the terminal."""
+    from tqdm import tqdm
+
+    return tqdm(desc=label, total=total, unit=f" {unit}", dynamic_ncols=True, file=sys.stderr)
+
+
 class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
     """A tqdm bar on stderr for work whose total may become known only during it.
 
@@ -51,8 +61,6 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
         unit: str = "steps",
         announced: bool = False,
     ) -> None:
-        from tqdm import tqdm
-
         hidden = not sys.stderr.isatty()
         self._label = label
         self._unit = unit
@@ -61,25 +69,20 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
         self._next_line_s = time.monotonic() + _LINE_S if hidden else math.inf
         if hidden and announced:
             log.log(NOTE, "%s%s", label, "" if total is None else f": {total} {unit}")
-        self._bar = tqdm(
-            desc=label,
-            total=total,
-            unit=f" {unit}",
-            dynamic_ncols=True,
-            file=sys.stderr,
-            disable=hidden,
-        )
+        self._bar = None if hidden else _shown(label, total, unit)
 
     def update(self, done: int, total: int | None = None) -> None:
         """Set the number of steps done, and optionally the total."""
-        self._bar.total = self._bar.total if total is None else total
-        self._bar.update(done - self._bar.n)
+        if self._bar is not None:
+            self._bar.total = self._bar.total if total is None else total
+            self._bar.update(done - self._bar.n)
         self._total = self._total if total is None else total
         self._advance_to(done)
 
     def advance(self) -> None:
         """Advance by one step."""
-        self._bar.update()
+        if self._bar is not None:
+            self._bar.update()
         self._advance_to(self._done + 1)
 
     def _advance_to(self, done: int) -> None:
@@ -93,7 +96,8 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
 
     def close(self) -> None:
         """Keep the bar as it is, and move the cursor below it."""
-        self._bar.close()
+        if self._bar is not None:
+            self._bar.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -5,7 +5,6 @@ archives.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import lzma
 import math
 import struct
@@ -246,31 +245,31 @@ def merge_events(
     """
     first_ns, last_ns = (int(recording.frame_times_ns[k]) for k in (chosen[0], chosen[-1]))
     samples = _samples_between(motion_samples(motion), first_ns, last_ns)
-    waiting = next(samples, None)
+    given = 0
     with contextlib.closing(frames):
         for frame in frames:
-            while waiting is not None and waiting.time_ns <= frame.time_ns:
-                yield waiting
-                waiting = next(samples, None)
+            until = int(samples.times_ns.searchsorted(frame.time_ns, side="right"))
+            yield from samples.records(slice(given, until))
+            given = max(given, until)
             yield frame
-    if waiting is not None:
-        yield waiting
-        yield from samples
+    yield from samples.take(slice(given, None))
 
 
 def _samples_between(
     motion: MotionSamples[MotionSample], first_ns: int, last_ns: int
-) -> Iterator[MotionSample]:
-    """Yield the samples that go with the frames between two times, see `merge_events`."""
+) -> MotionSamples[MotionSample]:
+    """Return the samples that go with the frames between two times, see `merge_events`."""
     times_ns = motion.times_ns
     is_imu = motion.is_imu
     after = times_ns[is_imu & (times_ns >= last_ns)]
     begin_ns = np.where(is_imu, first_ns - NS_PER_S, first_ns)
     end_ns = np.where(is_imu, after[0] if len(after) else last_ns, last_ns)
     inside = (begin_ns <= times_ns) & (times_ns <= end_ns)
-    if inside.any():
-        span = slice(int(inside.argmax()), len(inside) - int(inside[::-1].argmax()))
-        yield from itertools.compress(motion.take(span), inside[span])
+    if not inside.any():
+        return motion.take(inside)
+    span = slice(int(inside.argmax()), len(inside) - int(inside[::-1].argmax()))
+    around = motion.take(span)  # no copy of an hour of samples, where all of them belong to it
+    return around if inside[span].all() else around.take(inside[span])
 
 
 def npz_names(path: Path) -> frozenset[str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar, cast, overload
+from typing import Any, TypeVar, cast, overload
 
 import numpy as np
 
@@ -58,16 +58,21 @@ class MotionSamples(Sequence[Sample_co]):
 
     def __iter__(self) -> Iterator[Sample_co]:
         for k in range(0, len(self), _CHUNK):
-            part = slice(k, k + _CHUNK)
-            columns = (
-                self.times_ns[part].tolist(),
-                self.values[part, :3],
-                self.values[part, 3:],
-                self.is_imu[part],
-            )
-            for time_ns, first, second, is_imu in zip(*columns, strict=True):
-                kind = ImuSample if is_imu else VelocitySample
-                yield cast(Sample_co, kind(time_ns, first, second))
+            yield from self.records(slice(k, k + _CHUNK))
+
+    def records(self, rows: slice) -> list[Sample_co]:
+        """Return a record of each of some samples."""
+        columns = (
+            self.times_ns[rows].tolist(),
+            self.values[rows, :3],
+            self.values[rows, 3:],
+            self.is_imu[rows].tolist(),
+        )
+        made: list[Any] = [
+            (ImuSample if is_imu else VelocitySample)(time_ns, first, second)
+            for time_ns, first, second, is_imu in zip(*columns, strict=True)
+        ]
+        return made
 
     @property
     def kinds(self) -> frozenset[MotionSource]:

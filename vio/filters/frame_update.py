@@ -530,7 +530,7 @@ class FrameUpdate:
         lost = ~seen[:, newest]
         leaving = seen[:, 0] & full
         ending = lost | leaving
-        ended = np.flatnonzero(ending & good)
+        ended = (ending & good).nonzero()[0]
         joint = self._joint_columns(window, tracks)
         columns = tracks.stereo if joint is None else joint
         if len(ended):
@@ -563,7 +563,7 @@ class FrameUpdate:
         self._propagation.reported = FramePosterior.of(window, reported)
         self.smoothed = WindowPosterior.of(window, P, reported)
 
-        done = np.flatnonzero(ending & good & (depth_sigma < _UPDATE.map_depth_sigma))
+        done = (ending & good & (depth_sigma < _UPDATE.map_depth_sigma)).nonzero()[0]
         covariance = self._variance * tracks.information.point_covariance(done)
         if joint is not None:
             of_points = tracks.information.point_D_clones(done) @ V[window.state.clones]
@@ -608,7 +608,7 @@ class FrameUpdate:
         unsure = _scale_sigma(window) > _UPDATE.scale_sigma
         if room <= 0 or unsure or not candidates.any():
             return np.zeros(0, dtype=np.int64)
-        chosen = np.flatnonzero(candidates)
+        chosen = candidates.nonzero()[0]
         by_stereo = np.sqrt(self.tracks.variance) * relative_stereo_sigma(
             tracks.at, tracks.information.q, chosen
         )

@@ -10,7 +10,6 @@ function, as in Monin & Yaglom, Statistical fluid mechanics (1975).
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -66,7 +65,7 @@ class ImuHistory:
     """
 
     def __init__(self) -> None:
-        self._samples: deque[ImuSample] = deque(maxlen=_GAPS.max_samples)
+        self._samples: list[ImuSample] = []
         self._period = 0.0  # median distance, and samples since it was computed
         self._unmeasured = 0
 
@@ -74,18 +73,29 @@ class ImuHistory:
         """Take samples in order of time and drop what is too old: a gap, however long, makes
         none so.
         """
-        self._samples.extend(samples)
+        self._samples += samples
         self._unmeasured += len(samples)
-        while len(self._samples) * self.period_ns() > _GAPS.memory_s / S_PER_NS:
-            self._samples.popleft()
+        kept = min(len(self._samples), _GAPS.max_samples)
+        while True:
+            if self._unmeasured >= kept // _GAPS.measured_share:
+                self._measure(kept)
+            if kept * self._period <= _GAPS.memory_s / S_PER_NS:
+                break
+            kept -= 1
+        del self._samples[: len(self._samples) - kept]
 
     def period_ns(self) -> float:
         """Median distance of the samples, up to a few of them ago; 0 where there are not two."""
         if self._unmeasured >= len(self._samples) // _GAPS.measured_share:
-            times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
-            self._period = median(np.diff(times)) if len(times) > 1 else 0.0
-            self._unmeasured = 0
+            self._measure(len(self._samples))
         return self._period
+
+    def _measure(self, last: int) -> None:
+        """Measure the median distance of the last few samples."""
+        kept = self._samples[len(self._samples) - last :]
+        times = np.array([x.time_ns for x in kept], dtype=np.int64)
+        self._period = median(np.diff(times)) if len(times) > 1 else 0.0
+        self._unmeasured = 0
 
     def hidden(self, cuts_ns: FloatArray, times_ns: FloatArray) -> Hidden | None:
         """Cut the parts of an interval that lack samples finely, and say what they hide; None: none

@@ -7,6 +7,9 @@ sample.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TypeGuard, cast
+
 import numpy as np
 import numpy.typing as npt
 
@@ -14,6 +17,7 @@ from vio.dataclass import dataclass
 from vio.errors import CalibrationError, ConfigError, DataError
 from vio.geometry.lie import FloatArray, rigid_fault
 from vio.geometry.stereo import StereoCamera
+from vio.imu.faults import readings_of
 from vio.records import ImuSample, MotionSample, Observations
 from vio.setting import Section
 
@@ -103,6 +107,20 @@ class InputOrder:
                 "samples and frames in order of time"
             )
         self._sample_ns = now
+
+    def accept_imu(self, samples: Sequence[MotionSample]) -> TypeGuard[Sequence[ImuSample]]:
+        """Take one or more samples of an IMU at once, and return True; where `sample` refuses one
+        of them, or one is of another kind, take none.
+        """
+        before_ns = self._sample_ns
+        for x in samples:
+            if type(x) is not ImuSample or (before_ns is not None and x.time_ns <= before_ns):
+                return False
+            before_ns = x.time_ns
+        if not np.abs(readings_of(cast("Sequence[ImuSample]", samples))).max() < LARGEST:
+            return False
+        self._sample_ns = before_ns
+        return True
 
     def frame(self, seen: Observations, reached_ns: int) -> None:
         """Check the observations of a frame.

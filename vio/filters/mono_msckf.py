@@ -5,6 +5,7 @@ that is observable.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -108,6 +109,11 @@ class MonoMsckf(Msckf):
         self._samples.append(sample)
         while (sample.time_ns - self._samples[0].time_ns) * 1e-9 > 1.2 * STANDSTILL_S:
             self._samples.popleft()
+
+    def propagate_all(self, samples: Sequence[MotionSample]) -> None:
+        """Take motion samples, see `propagate`."""
+        for sample in samples:
+            self.propagate(sample)
 
     def _update(self, observations: Observations) -> UpdateReport:
         self._recent.append(observations)

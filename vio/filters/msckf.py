@@ -11,6 +11,7 @@ algorithm for improving consistency (2017); Barrau & Bonnabel (2017).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -35,7 +36,15 @@ from vio.filters.restart import GoodState, as_good_state, required, restarted
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Clone, Window
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, so3_exp, so3_log
+from vio.geometry.lie import (
+    FloatArray,
+    length,
+    se3_adjoint,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+    so3_log,
+)
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.geometry.upright import nearest_yaw
@@ -132,6 +141,13 @@ class Msckf(Backend):
         if self._source == "velocity" and self._window is not None:
             self._propagation.advance(self._window, sample.time_ns)
             self._measure()
+
+    def propagate_all(self, samples: Sequence[MotionSample]) -> None:
+        """Take motion samples, see `propagate`."""
+        if self._source == "imu" and self._order.accept_imu(samples):
+            self._propagation.take_imu(samples)
+        else:  # a velocity moves the state at once, and what is wrong is named by its own sample
+            super().propagate_all(samples)
 
     def take_rotation_comparison(self, comparison: RotationComparison | None) -> None:
         """Take how the camera's rotation compares with the gyro's; None: they were not compared
@@ -507,4 +523,4 @@ def _is_sane(window: Window, source: MotionSource | None) -> bool:
     """Whether the state is made of numbers, and with an IMU of a possible speed."""
     if not np.isfinite(window.prior.P).all() or not np.isfinite(window.nav.T_world_imu).all():
         return False
-    return source != "imu" or float(np.linalg.norm(window.nav.velocity)) < _MAX_SPEED_MPS
+    return source != "imu" or length(window.nav.velocity) < _MAX_SPEED_MPS

@@ -122,6 +122,7 @@ class Growth:
         return Growth(Phi @ self.Phi, Q, Q_parts, self.bridged or step.bridged, Phi_imu)
 
 
+_I3 = np.eye(3)
 NO_STEP = Growth(np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM)))
 
 
@@ -157,6 +158,10 @@ class ImuMotion:
         """Keep a sample until the interval that needs it; leave out faulty ones."""
         assert isinstance(sample, ImuSample)
         self._new.append(sample)
+
+    def take_all(self, samples: Sequence[ImuSample]) -> None:
+        """Keep samples, see `take`."""
+        self._new += samples
 
     @property
     def samples(self) -> Sequence[ImuSample]:
@@ -254,7 +259,7 @@ class ImuMotion:
         v = nav.velocity.copy()
         turned = np.zeros(3)
         total = float(times[-1]) * 1e-9
-        Phi = np.eye(DIM)
+        Phi = NO_STEP.Phi.copy()
         Q_parts = np.zeros((2, DIM, DIM))
         Q = np.empty((DIM, DIM))
         bias = np.concatenate([nav.gyro_bias, nav.accel_bias])
@@ -289,7 +294,7 @@ class ImuMotion:
         terms.
         """
         out = np.zeros((3, DIM + len(self._chosen)))
-        out[:, 9:12] = -np.eye(3)
+        out[:, 9:12] = -_I3
         if len(self._chosen):
             out[:, DIM:] = gyro_D_terms(raw_rate(nav.rate + nav.gyro_bias, nav.imu_terms))[
                 :, self._chosen
@@ -300,7 +305,9 @@ class ImuMotion:
         """Drop the samples that no interval from this time on needs."""
         samples = self.samples
         keep = 0
-        while keep + 1 < len(samples) and samples[keep + 1].time_ns <= time_ns:
+        for sample in samples[1:]:
+            if sample.time_ns > time_ns:
+                break
             keep += 1
         if keep and len(self._chosen):
             seconds = (samples[keep].time_ns - samples[0].time_ns) * 1e-9

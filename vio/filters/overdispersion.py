@@ -61,10 +61,12 @@ class Overdispersion:
             self._free += range(len(self._scores), len(self._scores) + _MAX_FEATURES)
             self._scores = np.concatenate([self._scores, np.zeros((_MAX_FEATURES, 6))])
         for k, (feature, (x, y)) in enumerate(zip(ids.tolist(), cells, strict=True)):
-            cluster = self._cluster.pop(feature, (x, y, self._calls // _FRAMES))
-            self._cluster[feature] = cluster  # a feature that began again stays in its cluster
-            row = self._row.pop(cluster, None)
-            rows[k] = self._row[cluster] = self._free.pop() if row is None else row
+            cluster = x, y, self._calls // _FRAMES
+            if feature in self._cluster:  # a feature that began again stays in its cluster
+                cluster = self._cluster.pop(feature)
+            self._cluster[feature] = cluster
+            row = self._row.pop(cluster) if cluster in self._row else self._free.pop()
+            rows[k] = self._row[cluster] = row
         loops.add_scores(rows, scores, self._scores, self._squares)
         self._calls += 1
         self._information += information.sum(axis=0)
@@ -76,7 +78,7 @@ class Overdispersion:
             self._scores[row] = 0.0
         known = self._information > 0
         if known.any():
-            ratio = float(np.mean(self._squares[known] / self._information[known]))
+            ratio = float((self._squares[known] / self._information[known]).mean())
             learned = (_PRIOR_TRACKS * PRIOR_FACTOR + self._tracks * ratio) / (
                 _PRIOR_TRACKS + self._tracks
             )

@@ -52,23 +52,23 @@ class Prior:
 
     def transform(self, M: FloatArray) -> None:
         """Turn the errors into `M error`, with M (D, D)."""
-        self.P = M @ self.P @ M.T
+        self.P = M @ self._P @ M.T
         self.delta = M @ self.delta
         self.error_D_constants = M @ self.error_D_constants
 
     def inflate(self, rows: slice, variances: FloatArray) -> None:
         """Add variances (k,) to those of some errors."""
-        self.P = self.P.copy()
+        self.P = self._P.copy()
         self.P[rows, rows] += np.diag(variances)
 
     def insert(self, first: int, covariance: FloatArray) -> None:
         """Add errors with a covariance (S, S), from the row `first` on, that depend on no other."""
-        D = len(self.P)
+        D = len(self._P)
         S = len(covariance)
         old = np.concatenate([np.arange(first), np.arange(first + S, D + S)])
         P = np.zeros((D + S, D + S))
         delta = np.zeros(D + S)
-        P[np.ix_(old, old)] = self.P
+        P[np.ix_(old, old)] = self._P
         delta[old] = self.delta
         P[first : first + S, first : first + S] = covariance
         self.P = P
@@ -86,10 +86,10 @@ class Prior:
             noise: covariance (k, k).
             of_scale: how they depend on the scale that is tested (k,).
         """
-        D = len(self.P) + len(J)
+        D = len(self._P) + len(J)
         own = slice(0, J.shape[1])
         P: FloatArray = np.empty((D, D))
-        loops.insert_rows(self.P, at, J, noise, P)
+        loops.insert_rows(self._P, at, J, noise, P)
         delta = self.delta
         V = self.error_D_constants
         self.delta = np.concatenate([delta[:at], J @ delta[own], delta[at:]])
@@ -108,9 +108,9 @@ class Prior:
             blocks: covariances of the noise (K, 3, 3).
             by_considered: B (3K, 4); None: zero.
         """
-        D = len(self.P) + len(A)
+        D = len(self._P) + len(A)
         P: FloatArray = np.empty((D, D))
-        loops.append_rows(self.P, A @ self.P, A, blocks, P)
+        loops.append_rows(self._P, A @ self._P, A, blocks, P)
         self.delta = np.concatenate([self.delta, A @ self.delta])
         V = A @ self.error_D_constants
         if by_considered is not None:
@@ -121,7 +121,7 @@ class Prior:
     def keep(self, rows: IntArray) -> None:
         """Marginalise all errors but those of given rows."""
         P = np.empty((len(rows), len(rows)))
-        loops.take_rows(self.P, rows, P)
+        loops.take_rows(self._P, rows, P)
         self.P = P
         self.delta = self.delta[rows]
         self.error_D_constants = self.error_D_constants[rows]
@@ -148,7 +148,7 @@ class Prior:
         fitted = fit(prior, A)
         moved = fitted.move(b)
         # the others follow by their correlation
-        shift: FloatArray = self.P[:, own] @ (b - A @ moved)
+        shift: FloatArray = self._P[:, own] @ (b - A @ moved)
         shift[own] = moved
         return fitted, shift - self.delta
 
@@ -176,7 +176,7 @@ class Prior:
             considered: `H' R^-1 C` (D, 4), C being the derivatives of the residuals by the
                 constants considered.
         """
-        prior = self._factor(information, len(self.P), first)
+        prior = self._factor(information, len(self._P), first)
         own = slice(prior.first, None)
         P = fit(prior, information[own, own]).covariance()
         delta = self.delta - P @ (vector + information @ self.delta)
@@ -193,7 +193,7 @@ class Prior:
             rows = repeated[0]
             kept = 1 - 1 / repeated[1]
             delta[rows] += kept * (self.delta[rows] - delta[rows])
-            P[rows, rows] += kept * (self.P[rows, rows] - P[rows, rows])
+            P[rows, rows] += kept * (self._P[rows, rows] - P[rows, rows])
             V[rows] += kept * (self.error_D_constants[rows] - V[rows])
         self.P = P
         self.delta = delta
@@ -206,7 +206,7 @@ class Prior:
         Directions in which the covariance is singular to rounding have no part: states are copies,
         or known.
         """
-        P = self.P[rows, rows]
+        P = self._P[rows, rows]
         delta = self.delta[rows]
         scale = np.sqrt(np.where(P.diagonal() > 0, P.diagonal(), 1.0))
         values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
@@ -224,7 +224,7 @@ class Prior:
         if information[:first].any():
             first = 0
         if (first, size) not in self._factors:
-            self._factors[first, size] = factor(self.P[:size, :size], first)
+            self._factors[first, size] = factor(self._P[:size, :size], first)
         return self._factors[first, size]
 
 
@@ -236,11 +236,7 @@ class Factor:
     L: FloatArray  # (n, n)
     # by Cholesky; False: by the eigenvectors of a P that is singular beyond rounding
     triangular: bool
-
-    @property
-    def first(self) -> int:
-        """Row of the first error that is factored."""
-        return len(self.P) - len(self.L)
+    first: int  # row of the first error that is factored, D - n
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,12 +311,12 @@ def factor(P: FloatArray, first: int = 0) -> Factor:
     _keep_positive(A, A, len(A))
     upper, failed = lapack.dpotrf(A.T, lower=0, overwrite_a=1)
     if not failed:
-        return Factor(P, upper.T, True)
+        return Factor(P, upper.T, True, first)
     values, vectors = np.linalg.eigh(P)
     root: FloatArray = np.array(
         vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64, order="C"
     )
-    return Factor(P, root, False)
+    return Factor(P, root, False, 0)
 
 
 def fit(prior: Factor, information: FloatArray) -> Fit:

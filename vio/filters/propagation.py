@@ -4,6 +4,8 @@ motion.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from vio.dataclass import dataclass
@@ -22,7 +24,7 @@ from vio.filters.online_calibration import NO_TWIST, Twist, body_twist, walk_var
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
-from vio.records import MotionPrior, MotionSample, MotionSource
+from vio.records import ImuSample, MotionPrior, MotionSample, MotionSource
 
 # Factors on the motion model's densities: at the start, at least, at most.
 IMU_FACTORS = (1.0, 1.0, 50.0)
@@ -90,6 +92,8 @@ class _Coming:
     growth: Growth  # since the last frame, with it
 
 
+_I3 = np.eye(3)
+_POSE = np.eye(6, DIM)  # the pose of a navigation state
 _NOTHING = FramePosterior(np.zeros((DIM, DIM)), np.zeros((DIM + 6, DIM + 6)), np.eye(4))
 
 
@@ -154,6 +158,12 @@ class Propagation:
     def take(self, sample: MotionSample) -> None:
         """Take a motion sample, which may change what the next step looks like."""
         self.motion.take(sample)
+        self._coming = None
+
+    def take_imu(self, samples: Sequence[ImuSample]) -> None:
+        """Take samples of an IMU at once, see `take`."""
+        assert isinstance(self.motion, ImuMotion)
+        self.motion.take_all(samples)
         self._coming = None
 
     def advance(self, window: Window, time_ns: int) -> None:
@@ -248,7 +258,7 @@ class Propagation:
         if last is None or last[0] is not nav or last[1] is not growth or last[2] != late_s:
             T, J = window.camera_at(late_s, twist, nav)
             if not window.calibration.moves_camera and "imu_terms" not in window.state:
-                M = growth.Phi[:6] - np.eye(6, DIM)
+                M = growth.Phi[:6] - _POSE
                 moved = M @ self.posterior.own[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
             else:
                 M = np.concatenate([J @ self.grown(window, nav, growth), -np.eye(6)], axis=1)
@@ -280,7 +290,7 @@ class Propagation:
         covariance = np.zeros((6, 6))
         # v = exp(phi) v_hat + xi_v, seen from the body turned by phi
         covariance[:3, :3] = R.T @ P[6:9, 6:9] @ R
-        by_gyro = np.eye(3) * self.motion.rate_variance(self.noise.factors)
+        by_gyro = _I3 * self.motion.rate_variance(self.noise.factors)
         covariance[3:, 3:] = rate_D_error @ P @ rate_D_error.T + by_gyro
         twist = Twist(body_twist(nav.T_world_imu, nav.velocity, nav.rate), covariance)
         self._twist = nav, growth, twist

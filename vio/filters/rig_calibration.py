@@ -155,7 +155,7 @@ class RigCalibration:
         follow them (..., k, 4).
         """
         V = V * self.considered_sigmas(window)
-        out: FloatArray = V @ np.swapaxes(V, -1, -2)
+        out: FloatArray = V @ V.swapaxes(-1, -2)
         return out
 
     def landmark_covariances(self, window: Window) -> FloatArray:

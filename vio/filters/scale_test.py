@@ -16,6 +16,7 @@ import numpy as np
 from vio.filters import pose_loops as loops
 from vio.filters.navigation import NavState
 from vio.geometry.lie import FloatArray
+from vio.numerics.statistics import squared_distance
 
 _SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
 # More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
@@ -35,7 +36,7 @@ def is_clear(velocity: FloatArray, covariance: FloatArray) -> bool:
     """Whether a velocity (3,) of a covariance (3, 3) is far enough from its noise to tell the
     scale.
     """
-    return float(velocity @ np.linalg.solve(covariance + 1e-18 * np.eye(3), velocity)) > _CLEAR
+    return squared_distance(velocity, covariance, 1e-18) > _CLEAR
 
 
 def scaled_nav(nav: NavState, T_cam0_imu: FloatArray) -> FloatArray:

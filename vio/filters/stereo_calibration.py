@@ -223,7 +223,7 @@ def eliminate_points(
     `sum_f M_f - G_f C_f^-1 G_f'`: exact elimination of each point. Without columns, S is zero;
     those given learn the cross information of the chosen tracks.
     """
-    rows = np.flatnonzero(chosen)
+    rows = chosen.nonzero()[0]
     size = info.G.shape[1]
     D = size if columns is None else size + len(columns.wanted.chosen)
     out = Eliminated(np.empty((3 * len(rows), D)), np.zeros((D, D)), np.zeros(D))

@@ -8,7 +8,7 @@ and its uncertainty is that of the pose at the handover.
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,7 +107,7 @@ class SupervisedMsckf(Backend):
         self._stand_in: Msckf | None = None  # images alone, until the first sample
         self._handover: _Handover | None = None
         self._earlier: Landmarks | None = None  # of the filters before, in the reported world
-        self._recent = deque[MotionSample | Observations]()
+        self._recent: list[MotionSample | Observations] = []
         self._rotation: RotationComparison | None = None
 
     def _new(self) -> Msckf:
@@ -126,8 +126,12 @@ class SupervisedMsckf(Backend):
 
     def propagate(self, sample: MotionSample) -> None:
         """Take a motion sample, see `Msckf`."""
-        self._filter.propagate(sample)
-        self._recent.append(sample)
+        self.propagate_all([sample])
+
+    def propagate_all(self, samples: Sequence[MotionSample]) -> None:
+        """Take motion samples, see `Msckf`."""
+        self._filter.propagate_all(samples)
+        self._recent += samples
 
     def update(self, observations: Observations) -> UpdateReport:
         """Propagate to the time of the frame and update with its observations, see `Msckf`."""
@@ -154,8 +158,12 @@ class SupervisedMsckf(Backend):
         recent = self._recent
         recent.append(observations)
         since_ns = observations.time_ns - _RECENT_NS
-        while recent[0].time_ns < since_ns:
-            recent.popleft()
+        old = 0
+        for event in recent:
+            if event.time_ns >= since_ns:
+                break
+            old += 1
+        del recent[:old]
 
     def _follow(self) -> None:
         """Keep the pose at the handover that of the images alone, while the filter still corrects

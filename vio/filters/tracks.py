@@ -37,14 +37,14 @@ class TrackTable:
         rows: IntArray = np.empty(len(seen), dtype=np.int64)
         new = loops.find_rows(seen.ids, self._ids[self._rows], self._rows, rows)
         if new:
-            unknown = np.flatnonzero(rows < 0)
+            unknown = (rows < 0).nonzero()[0]
             while new > len(self._free):
                 self._grow(2 * len(self._ids))
             rows[unknown] = self._free[-1 : -new - 1 : -1]
             self._free = self._free[:-new]
             self._ids[rows[unknown]] = seen.ids[unknown]
             together = np.concatenate([self._rows, rows[unknown]])
-            self._rows = together[np.argsort(self._ids[together])]
+            self._rows = together[self._ids[together].argsort()]
         loops.write_column(rows, column, seen.z, precision(seen), self._z, self._weight)
 
     def rows(self) -> IntArray:
@@ -139,7 +139,7 @@ def rows_of(seen: Observations, ids: IntArray) -> tuple[IntArray, BoolArray]:
     """
     if not len(seen) or not len(ids):
         return np.zeros(0, dtype=np.int64), np.zeros(len(ids), dtype=np.bool_)
-    order = np.argsort(seen.ids)
+    order = seen.ids.argsort()
     at = np.minimum(np.searchsorted(seen.ids, ids, sorter=order), len(order) - 1)
     rows = order[at]
     found = seen.ids[rows] == ids

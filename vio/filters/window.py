@@ -359,7 +359,7 @@ class Window:
         rows = np.concatenate(
             [np.ones(self.state.landmarks.start, dtype=np.bool_), np.repeat(chosen, 3)]
         )
-        self.prior.keep(np.flatnonzero(rows))
+        self.prior.keep(rows.nonzero()[0])
         self.landmark_ids = self.landmark_ids[chosen]
         self.landmarks = self.landmarks[chosen]
         self._lay_out()

@@ -15,7 +15,7 @@ from vio.filters.prior import Fit
 from vio.filters.window import Clones, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
-from vio.numerics.statistics import chi_square_quantile
+from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import Estimate
 
 _MIN_MOTION_M = 1e-3  # of all poses from the oldest one: less has no scale
@@ -100,7 +100,7 @@ class WindowPosterior:
 
     def _place(self, frame_index: int) -> int | None:
         """Which clone is that of a frame; None: it is not in the window."""
-        found = np.flatnonzero(self.clones.frame_indices == frame_index)
+        found = (self.clones.frame_indices == frame_index).nonzero()[0]
         return int(found[0]) if len(found) else None
 
     def motion(self, older: int, newer: int) -> RelativePose | None:
@@ -141,7 +141,7 @@ class WindowPosterior:
         A = se3_adjoint(T_old_world)
         C = A @ (self.P[a, a] + self.P[b, b] - self.P[a, b] - self.P[b, a]) @ A.T
         limit = _STATIONARY_LIMIT  # no eigenvalue of C is larger than its trace
-        most = float(np.trace(C)) + 6e-18
+        most = float(C.trace()) + 6e-18
         moved = new.T_world_imu[:3, 3] - old.T_world_imu[:3, 3]
         if float(moved @ moved) > limit * most:  # rho is no shorter, as |J_l(phi) rho| <= |rho|
             return False
@@ -153,8 +153,7 @@ class WindowPosterior:
         )
         if largest[0] > velocity_sigma_mps or largest[1] > rate_sigma_radps:
             return False
-        squared = float(xi @ np.linalg.solve(C + 1e-18 * np.eye(6), xi))
-        return squared < limit
+        return squared_distance(xi, C, 1e-18) < limit
 
 
 def scale_sigma(posterior: WindowPosterior) -> float | None:

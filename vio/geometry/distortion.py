@@ -173,7 +173,10 @@ def project_point(
     """
     p = np.asarray(p_cam, dtype=np.float64)
     xy, valid = camera.lens.project(camera.coefficients, p)
-    return xy * (camera.fu, camera.fv) + (camera.cu, camera.cv), valid
+    uv = np.empty(xy.shape)
+    uv[..., 0] = xy[..., 0] * camera.fu + camera.cu
+    uv[..., 1] = xy[..., 1] * camera.fv + camera.cv
+    return uv, valid
 
 
 def unproject_pixel(

@@ -73,6 +73,18 @@ def _one(phi: FloatArray) -> tuple[float, float, float, float] | None:
     return (x, y, z, angle) if math.isfinite(angle) else None
 
 
+def length(vector: FloatArray) -> float:
+    """Length of a single vector (n,): `np.linalg.norm`, to the bit, in a few calls."""
+    return math.sqrt(vector.dot(vector))
+
+
+def lengths(vectors: FloatArray) -> FloatArray:
+    """Lengths (N,) of vectors of the plane (N, 2)."""
+    x = vectors[:, 0]
+    y = vectors[:, 1]
+    return np.sqrt(x * x + y * y)
+
+
 def _series(x: float, y: float, z: float, b: float, c: float) -> FloatArray:
     """`I + b W + c W W` (3, 3) with W the skew-symmetric matrix of a vector."""
     xx = c * x * x

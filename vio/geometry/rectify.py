@@ -325,7 +325,7 @@ def lookup(
         rows = np.arange(top, min(top + _ROWS, rectified.height))
         pixels = np.stack(np.meshgrid(np.arange(rectified.width), rows), axis=-1)
         uv, valid = project_point(camera, left_rays(rectified, pixels) @ R_rect_cam)
-        uv = np.where(valid[..., None], uv, -1e4)
+        uv[~valid] = -1e4
         u[rows] = uv[..., 0]
         v[rows] = uv[..., 1]
     return u, v

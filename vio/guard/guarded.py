@@ -57,6 +57,8 @@ class GuardedFrontend:
     def __init__(self, frontend: Frontend, camera: StereoCamera) -> None:
         self.frontend = frontend
         self._pair = camera.kind == "stereo"
+        # the front end, where it may check its matches itself; slow to ask in every frame
+        self._may_check = frontend if isinstance(frontend, ChecksMatches) else None
         self._checks = image_checks(camera)
         self._matches = RightMatches(camera)
         self._swap = next((c for c in self._checks if isinstance(c, SwapDetector)), None)
@@ -89,11 +91,10 @@ class GuardedFrontend:
 
         Without a usable right image there is nothing to check.
         """
-        frontend = self.frontend
         seen = output.observations
         if not right_usable:
             seen = without_right(seen)
-        elif not (isinstance(frontend, ChecksMatches) and frontend.checks_matches):
+        elif self._may_check is None or not self._may_check.checks_matches:
             seen = self._matches.inspect(seen)
             found = (*found, *self._matches.take_findings())
         return _with_findings(output, seen, found)

@@ -145,8 +145,11 @@ class ImuSampleCheck:
         """Count the first of some samples, of times (K,) and readings (K, 6), that nothing is to
         be said of.
         """
-        if self._previous is None or self._held or any(r.repeats for r in self._repeats):
+        if self._previous is None or self._held:
             return 0
+        for r in self._repeats:
+            if r.repeats:
+                return 0
         passed = self._spikes.pass_on(times, readings)
         for r in self._repeats:
             r.count_others(passed)

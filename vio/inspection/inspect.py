@@ -181,7 +181,7 @@ def _tracking_parts(
             if imu and check is not None:
                 findings += _messages(check.frame(output.observations), mono=mono)
         elif isinstance(event, ImuSample) and check is not None:
-            check.imu(event)
+            check.imu([event])
     if imu and check is not None:
         findings += _messages(check.finish(), mono=mono)
     kept = float(np.median(tracked[1:])) if len(tracked) > 1 else 0.0

@@ -5,13 +5,14 @@ them.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 from vio.dataclass import dataclass
 from vio.errors import DataError, DivergedError
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.live.imu_trial import AS_GIVEN, ImuTrial, corrected
+from vio.live.imu_trial import AS_GIVEN, ImuTrial, corrected, corrected_all
 from vio.live.recovery import Recovery
 from vio.monitor.run import RunMonitor
 from vio.numerics.robust import median
@@ -65,15 +66,14 @@ class FramePipeline:
         self._revised: dict[int, Estimate] = {}
         self._recovery = Recovery()
 
-    def sample(self, sample: MotionSample) -> None:
-        """Take one motion sample."""
+    def samples(self, samples: Sequence[MotionSample]) -> None:
+        """Take motion samples in order of time, all that come before the next frame."""
         start = time.perf_counter()
-        self.monitor.sample(sample)
+        self.monitor.samples(samples)
         if self._motion is not None:
             if self._trial is not None:
-                self._trial.take(sample)
-            if (usable := self.usable(sample)) is not None:
-                self.backend.propagate(usable)
+                self._trial.take_samples(samples)
+            self.backend.propagate_all(corrected_all(samples, self._imu))
         self._propagate_ms += 1e3 * (time.perf_counter() - start)
 
     def frame(self, frame: StereoFrame) -> FrameResult | None:

@@ -10,6 +10,7 @@ before. Features are tracked well without the filter's prediction, so they are n
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import replace
 
 from vio.errors import DivergedError, EstimationError
@@ -40,17 +41,19 @@ class ImuTrial:
         self._fresh = None
         self._taken = []
 
-    def take(self, event: MotionSample | Observations) -> None:
-        """Take a sample as it was recorded, or the observations of a frame, as they are given to
-        the back end.
-        """
+    def take_samples(self, samples: Sequence[MotionSample]) -> None:
+        """Take samples as they were recorded."""
+        if self._fresh is not None:
+            self._taken += samples
+
+    def take(self, seen: Observations) -> None:
+        """Take the observations of a frame, as they are given to the back end."""
         if self._fresh is None:
             return
-        self._taken.append(event)
-        if type(event) is Observations:
-            self._frames += 1
-            if self._frames > _MAX_FRAMES:
-                self.close()
+        self._taken.append(seen)
+        self._frames += 1
+        if self._frames > _MAX_FRAMES:
+            self.close()
 
     def again(self, verdict: ImuVerdict) -> tuple[Backend, dict[int, Estimate]] | None:
         """Give everything to a new back end, with the IMU that a verdict leaves; nothing can be
@@ -84,6 +87,13 @@ def _estimates(
         elif (sample := corrected(event, verdict)) is not None:
             backend.propagate(sample)
     return estimates
+
+
+def corrected_all(samples: Sequence[MotionSample], verdict: ImuVerdict) -> Sequence[MotionSample]:
+    """Return samples in the right units, less those that are not to be used."""
+    if verdict is AS_GIVEN:
+        return samples
+    return [x for x in (corrected(sample, verdict) for sample in samples) if x is not None]
 
 
 def corrected(sample: MotionSample, verdict: ImuVerdict) -> MotionSample | None:

@@ -5,10 +5,11 @@ recordings share.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from vio.dataclass import dataclass
 from vio.live.frame_pipeline import FramePipeline
 from vio.records import Estimate, Event, FrameResult, MotionSample, StereoFrame
 
@@ -19,6 +20,14 @@ if TYPE_CHECKING:
 # a frame waits until one that is so much newer has come: then the IMU is silent
 LONGEST_WAIT_NS = 100_000_000
 _MAX_SAMPLES = 100_000  # that wait: minutes in which no frame came
+
+
+@dataclass(frozen=True, slots=True)
+class Due:
+    """What can be processed now: samples, then a frame."""
+
+    samples: list[MotionSample]  # since the frame before, in order of time
+    frame: StereoFrame | None  # None: no other frame will come
 
 
 class EventOrder:
@@ -37,66 +46,69 @@ class EventOrder:
         """
         self._wait = wait_for_imu
         self._frames: deque[StereoFrame] = deque()
-        self._samples: deque[MotionSample] = deque(maxlen=_MAX_SAMPLES)
+        self._samples: list[MotionSample] = []
         self._newest_ns: int | None = None  # sample that has come
         self._released_ns: int | None = None  # newest sample that was released
         # from a frame's stamp to its exposure on the IMU's clock, 0 or more, as estimated
         self.exposed_after_ns = 0
 
-    def add(self, event: Event) -> Iterator[Event]:
+    def add(self, event: Event) -> Iterator[Due]:
         """Take an event, and yield what can be processed now, in order.
 
         Frames come in order of time, and samples do; a frame may come before or after its samples.
         Whether a second frame is due may depend on the time offset that was estimated with the
         first, so take one after the other.
         """
-        if isinstance(event, StereoFrame):
-            self._frames.append(event)
-        else:
-            self._samples.append(event)
-            self._newest_ns = event.time_ns
-        while self._frames and self._is_due(self._frames[0]):
-            yield from self._release()
+        if not isinstance(event, StereoFrame):
+            return self.add_samples([event])
+        self._frames.append(event)
+        return self._due()
 
-    def flush(self) -> list[Event]:
-        """Return all that is held, in order; what has not come will not come."""
-        ready: list[Event] = []
+    def add_samples(self, samples: Sequence[MotionSample]) -> Iterator[Due]:
+        """Take one or more samples at once, as `add` does one after the other."""
+        self._samples += samples
+        self._newest_ns = samples[-1].time_ns
+        del self._samples[:-_MAX_SAMPLES]
+        return self._due()
+
+    def flush(self) -> Iterator[Due]:
+        """Yield all that is held, in order; what has not come will not come."""
         while self._frames:
-            ready += self._release()
-        ready += self._samples
-        self._samples.clear()
-        return ready
+            yield self._release()
+        samples = self._samples
+        self._samples = []
+        yield Due(samples, None)
+
+    def _due(self) -> Iterator[Due]:
+        while self._frames and self._is_due(self._frames[0]):
+            yield self._release()
 
     def _is_due(self, frame: StereoFrame) -> bool:
         if not self._wait:
             return True
-        if self._newest_ns is not None and self._newest_ns >= self._exposed_ns(frame):
+        exposed_ns = frame.time_ns + self.exposed_after_ns
+        if self._newest_ns is not None and self._newest_ns >= exposed_ns:
             return True
         return self._frames[-1].time_ns - frame.time_ns >= LONGEST_WAIT_NS
 
-    def _release(self) -> list[Event]:
-        """The oldest frame after the samples up to its time and, where it waits, one at or after
-        it to interpolate.
+    def _release(self) -> Due:
+        """The oldest frame after the samples up to its exposure on the IMU's clock and, where it
+        waits, one at or after it to interpolate.
         """
         frame = self._frames.popleft()
-        ready: list[Event] = []
-        while self._samples and (
-            self._samples[0].time_ns <= self._exposed_ns(frame) or self._lacks_sample(frame)
-        ):
-            sample = self._samples.popleft()
-            self._released_ns = sample.time_ns
-            ready.append(sample)
-        return [*ready, frame]
-
-    def _lacks_sample(self, frame: StereoFrame) -> bool:
-        """Whether no sample at or after the frame has been released that it waits for."""
-        return self._wait and (
-            self._released_ns is None or self._released_ns < self._exposed_ns(frame)
-        )
-
-    def _exposed_ns(self, frame: StereoFrame) -> int:
-        """Time on the IMU's clock that a frame's samples must reach."""
-        return frame.time_ns + self.exposed_after_ns
+        exposed_ns = frame.time_ns + self.exposed_after_ns
+        released_ns = self._released_ns
+        count = 0
+        for sample in self._samples:
+            lacks_sample = self._wait and (released_ns is None or released_ns < exposed_ns)
+            if sample.time_ns > exposed_ns and not lacks_sample:
+                break
+            released_ns = sample.time_ns
+            count += 1
+        self._released_ns = released_ns
+        samples = self._samples[:count]
+        del self._samples[:count]
+        return Due(samples, frame)
 
 
 _MIN_WAIT_S = 1e-3  # a velocity carries the pose that far as well as the IMU does
@@ -135,6 +147,10 @@ class EventProcessor:
         """
         return self._process(self._order.add(event))
 
+    def add_samples(self, samples: Sequence[MotionSample]) -> list[FrameResult]:
+        """Take one or more motion samples at once, as `add` does one after the other."""
+        return self._process(self._order.add_samples(samples))
+
     def finish(self) -> list[FrameResult]:
         """Process the frames that still wait, and let the checks report what they have not yet
         reported.
@@ -153,18 +169,18 @@ class EventProcessor:
         if self.map is not None:
             self.map.close()
 
-    def _process(self, events: Iterable[Event]) -> list[FrameResult]:
-        """Give events that are due to the pipeline."""
+    def _process(self, due: Iterable[Due]) -> list[FrameResult]:
+        """Give what is due to the pipeline."""
         results: list[FrameResult] = []
-        for event in events:
-            if not isinstance(event, StereoFrame):
-                self.pipeline.sample(event)
-                continue
-            result = self.pipeline.frame(event)
-            if result is not None:
-                results.append(self._in_map(event, result))
+        for step in due:
+            frame = step.frame
+            if step.samples:
+                self.pipeline.samples(step.samples)
+            result = None if frame is None else self.pipeline.frame(frame)
+            if frame is not None and result is not None:
+                results.append(self._in_map(frame, result))
                 self.estimate = results[-1].estimate
-                self._last_index = event.index
+                self._last_index = frame.index
                 self._order.exposed_after_ns = _wait_ns(self.estimate)
         return results
 

@@ -13,15 +13,16 @@ prediction agrees, and they are used.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
 from vio.dataclass import dataclass
-from vio.geometry.lie import FloatArray, se3_log
+from vio.geometry.lie import FloatArray, lengths, se3_log
 from vio.imu.standstill import STANDSTILL_S, blocks_agree
 from vio.numerics.compiled import compiled
 from vio.numerics.robust import median
-from vio.numerics.statistics import chi_square_quantile
+from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import (
     S_PER_NS,
     Image,
@@ -72,7 +73,7 @@ class FrozenImages:
     """Compares each pair with the last one that showed something new."""
 
     def __init__(self) -> None:
-        self._imu: deque[ImuSample] = deque()
+        self._imu: list[ImuSample] = []  # the last half second
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
         self._seen: Observations | None = None  # its features
         self._seen_before: Observations | None = None  # those of the frame before
@@ -87,11 +88,15 @@ class FrozenImages:
         # median error of each frame's predicted pixels
         self._errors_px: deque[float] = deque(maxlen=_RECENT)
 
-    def sample(self, sample: ImuSample) -> None:
-        """Take a sample of the IMU."""
-        self._imu.append(sample)
-        while (sample.time_ns - self._imu[0].time_ns) * S_PER_NS > STANDSTILL_S:
-            self._imu.popleft()
+    def samples(self, samples: Sequence[ImuSample]) -> None:
+        """Take samples of the IMU."""
+        self._imu += samples
+        old = 0
+        for sample in self._imu:
+            if (self._imu[-1].time_ns - sample.time_ns) * S_PER_NS <= STANDSTILL_S:
+                break
+            old += 1
+        del self._imu[:old]
 
     def observations(self, seen: Observations) -> None:
         """Take the features of a frame that `check` let pass."""
@@ -209,8 +214,7 @@ class FrozenImages:
             return False
         xi = se3_log(motion.T_curr_prev)
         C = motion.covariance
-        scale = float(np.trace(C)) + 1e-18
-        return bool(xi @ np.linalg.solve(C + 1e-9 * scale * np.eye(6), xi) > _LIMIT)
+        return squared_distance(xi, C, 1e-9 * (float(C.trace()) + 1e-18)) > _LIMIT
 
 
 def _equal(a: Image, b: Image) -> bool:
@@ -225,7 +229,7 @@ def _moved(before: Observations, now: Observations | TrackPrior) -> tuple[IntArr
     differ in the left image.
     """
     a, b = shared_rows(before.ids, now.ids)
-    return a, np.asarray(np.linalg.norm(now.z[b, :2] - before.z[a, :2], axis=1))
+    return a, lengths(now.z[b, :2] - before.z[a, :2])
 
 
 def _median_flow_px(before: Observations, now: Observations) -> float:
@@ -257,7 +261,7 @@ def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
     of_images = seen.z[:_CORNERS, :2], seen.z[seen.has_right][:_CORNERS, 2:]
     for old, new, pixels in zip(_images(before), _images(now), of_images, strict=False):
         flow = corner_flow(old, new, pixels)
-        if len(flow) < _MIN_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
+        if len(flow) < _MIN_CORNERS or (lengths(flow) < _UNMOVED_PX).mean() < _SHARE:
             return False
     return True
 

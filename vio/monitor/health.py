@@ -4,6 +4,7 @@ each event is one line.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from vio.calibration.severity import rows_grade
 from vio.dataclass import dataclass
 from vio.findings import Finding
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, length
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, BoolArray, Estimate, IntArray, Observations, UpdateReport
 
@@ -220,9 +221,8 @@ class RunHealth:
         lines: list[Finding] = []
         position = estimate.T_world_imu[:3, 3].copy()
         if self._last is not None and estimate.time_ns > self._last[0]:
-            speed = float(np.linalg.norm(position - self._last[1])) / (
-                (estimate.time_ns - self._last[0]) * 1e-9
-            )
+            elapsed_s = (estimate.time_ns - self._last[0]) * 1e-9
+            speed = length(position - self._last[1]) / elapsed_s
             line = f"frame {index}: the estimate moves at {speed:.0f} m/s: the filter has diverged"
             lines += self._once(index, "speed", speed, _MAX_SPEED_MPS, line)
         self._last = estimate.time_ns, position
@@ -231,7 +231,7 @@ class RunHealth:
             ("accelerometer bias", estimate.accel_bias, _MAX_ACCEL_BIAS_MPS2, "m/s^2"),
         ):
             if bias is not None:
-                size = float(np.linalg.norm(bias))
+                size = length(bias)
                 line = f"frame {index}: the {name} is estimated as {size:.2g} {unit}, which no working sensor has"
                 lines += self._once(index, name, size, limit, line)
         return lines
@@ -246,7 +246,7 @@ class RunHealth:
 
 def _position_sigma(estimate: Estimate) -> float:
     """Standard deviation of the position, m."""
-    return float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+    return math.sqrt(estimate.covariance[:3, :3].trace())
 
 
 _SPAN_S = 1.0

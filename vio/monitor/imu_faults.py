@@ -5,7 +5,7 @@ repeat to the last bit, and those at the end of a sensor's range.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -129,13 +129,23 @@ class ImuSilence:
         self._waiting = 0  # frames before the first sample
         self._late_said = False
 
-    def sample(self, time_ns: int) -> tuple[str, ...]:
-        """Take the stamp of a sample; return the line on the gap that it ends."""
+    def samples(self, times_ns: Sequence[int]) -> Iterator[tuple[int, str]]:
+        """Take the stamps of one or more samples; yield the line on each gap, after the place of
+        the sample that ends it.
+        """
         if self._first_imu_ns is None:
-            self._first_imu_ns = time_ns
-        lines = () if self._last_frame is None else self._gap(time_ns, "")
-        self._times.append(time_ns)
-        return lines
+            self._first_imu_ns = times_ns[0]
+        before_ns = self._times[-1] if self._times else times_ns[0]
+        taken = 0
+        for k, time_ns in enumerate(times_ns):
+            # nearly no sample ends a gap, and the median that `_gap` takes is slow
+            if self._last_frame is not None and (time_ns - before_ns) * S_PER_NS > GAP_S:
+                self._times.extend(times_ns[taken:k])
+                taken = k
+                for line in self._gap(time_ns, ""):
+                    yield k, line
+            before_ns = time_ns
+        self._times.extend(times_ns[taken:])
 
     def frame(self, index: int, time_ns: int) -> tuple[str, ...]:
         """Take the number and stamp of a frame; return the line on an IMU that began late."""
@@ -171,7 +181,7 @@ class ImuSilence:
         if not self._times:
             return ()
         length_s = (until_ns - self._times[-1]) * S_PER_NS
-        if length_s <= GAP_S:  # as for nearly every sample; the median below is slow
+        if length_s <= GAP_S:
             return ()
         usual_s = float(np.median(np.diff(self._times))) * S_PER_NS if len(self._times) > 1 else 0.0
         if length_s <= max(GAP_S, GAP_STEPS * usual_s):

@@ -86,9 +86,9 @@ class InertialCheck:
             self._jumped = True
             self.reset()
 
-    def imu(self, sample: ImuSample) -> None:
-        """Add one sample."""
-        self._samples.add(sample)
+    def imu(self, samples: Sequence[ImuSample]) -> None:
+        """Add samples in order of time."""
+        self._samples.add(samples)
 
     def frame(self, observations: Observations) -> tuple[InertialFinding, ...]:
         """Add the observations of one frame, and return new findings."""

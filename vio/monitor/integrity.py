@@ -15,7 +15,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.findings import CODES, INTEGRITIES, Finding, Integrity, worst
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, length
 from vio.records import NS_PER_S, Estimate
 
 _HOLDS_NS = NS_PER_S  # an event without an end is one of the second after it
@@ -141,7 +141,7 @@ class IntegrityMonitor:
         self._last = estimate.time_ns, position.copy()
         if last is None or not usable or estimate.time_ns <= last[0]:
             return
-        step_m = float(np.linalg.norm(position - last[1]))
+        step_m = length(position - last[1])
         self._speed_mps = max(self._speed_mps, step_m * NS_PER_S / (estimate.time_ns - last[0]))
 
 

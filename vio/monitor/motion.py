@@ -47,7 +47,7 @@ class CameraTwists:
 
     def frame(self, seen: Observations) -> Intervals | None:
         """Add one frame; every `BATCH` frames, return the motions since the last batch."""
-        rows = np.flatnonzero(seen.has_right & ~seen.stale)
+        rows = (seen.has_right & ~seen.stale).nonzero()[0]
         if len(rows) > _TRACKS:
             # The same random choice of ids in every frame, so that tracks continue.
             hashed = (seen.ids[rows] * np.int64(2654435761)) & np.int64(0xFFFFFFFF)
@@ -150,7 +150,7 @@ class Record:
             for at in edges
         )
         covered = (edges[0] >= self.t[0]) & (edges[1] <= self.t[-1])
-        for k in np.flatnonzero(np.diff(self.t) > GAP_S):
+        for k in (np.diff(self.t) > GAP_S).nonzero()[0]:
             covered &= (edges[1] <= self.t[k]) | (edges[0] >= self.t[k + 1])
         return (high - low) / (self.end - self.begin)[None, :, None], covered
 

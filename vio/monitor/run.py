@@ -89,10 +89,10 @@ class RunMonitor:
         self.pairs_shifted_by = 0
         self._integrity = IntegrityMonitor()
 
-    def sample(self, sample: MotionSample) -> None:
-        """Add one motion sample; it is judged with all others before the next frame."""
-        if self._silence is not None and isinstance(sample, ImuSample):
-            self._new.append(sample)
+    def samples(self, samples: Iterable[MotionSample]) -> None:
+        """Add motion samples; they are judged with all others before the next frame."""
+        if self._silence is not None:
+            self._new += [x for x in samples if isinstance(x, ImuSample)]
 
     def _take_new(self) -> None:
         """Judge the samples since the last frame."""
@@ -101,12 +101,10 @@ class RunMonitor:
         if self._silence is None or not new:
             return
         taken = 0
-        for k, sample in enumerate(new):
-            gap = self._silence.sample(sample.time_ns)
-            if gap:  # what is to be said of earlier samples comes first
-                self._check(new[taken:k])
-                self._report("imu-gap", gap)
-                taken = k
+        for k, gap in self._silence.samples([x.time_ns for x in new]):
+            self._check(new[taken:k])  # what is to be said of earlier samples comes first
+            self._report("imu-gap", [gap])
+            taken = k
         self._check(new[taken:])
 
     def _check(self, samples: list[ImuSample]) -> None:
@@ -117,9 +115,8 @@ class RunMonitor:
         self._add(findings)
         if any(finding.code == "imu-saturated" for finding in findings):
             self._inertial.clipped = True
-        for x in usable:
-            self._inertial.imu(x)
-            self._frozen.sample(x)
+        self._inertial.imu(usable)
+        self._frozen.samples(usable)
 
     def repeats(self, frame: StereoFrame, expected: Prediction | None) -> bool:
         """Return whether a frame shows an earlier exposure again and must not be used; called

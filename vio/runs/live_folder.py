@@ -316,8 +316,7 @@ class _Trajectory:
         growing = replace(growing, replaces=(), inputs={})
         keeps = settings.save_observations
         self._recorder = _recorder(growing, self._state.body, self._config, keeps=keeps)
-        for sample in self._early:
-            self._recorder.sample(sample)
+        self._recorder.take_samples(self._early)
         self._early = []
 
     @property
@@ -326,13 +325,12 @@ class _Trajectory:
         assert self._recorder is not None
         return self._recorder
 
-    def samples(self, samples: Iterable[MotionSample]) -> None:
+    def samples(self, samples: Sequence[MotionSample]) -> None:
         """Take motion samples."""
         if self._recorder is None:
             self._early += samples
             return
-        for sample in samples:
-            self._recorder.sample(sample)
+        self._recorder.take_samples(samples)
 
     def frame(
         self, result: FrameResult, late: Mapping[int, Estimate], findings: tuple[Finding, ...]

@@ -140,7 +140,7 @@ class RunControl:
 
     folder: GrowingFolder | None = None  # None: everything stays in memory
     resume: bool = False  # go on from the checkpoint in the folder
-    # asked after each event; a reason ends the run in order
+    # asked after each frame; a reason ends the run in order
     should_stop: Callable[[], str | None] = lambda: None
 
 
@@ -368,18 +368,35 @@ class _RunState:
     sample_ns: int | None = None  # newest time of a motion sample that was taken
     delay: int = 0  # frames by which the recording's right images are late
 
-    def is_new(self, event: Event) -> bool:
-        """Whether an event of a recording that is read again has not been taken before."""
-        known = self.frame_ns if isinstance(event, StereoFrame) else self.sample_ns
-        return known is None or event.time_ns > known
+    def not_taken(self, events: Iterable[Event]) -> Iterator[Event]:
+        """Yield the events of a recording that is read again which were not taken before."""
+        for event in events:
+            known = self.frame_ns if isinstance(event, StereoFrame) else self.sample_ns
+            if known is None or event.time_ns > known:
+                yield event
 
-    def note(self, event: Event) -> None:
-        """Note that an event was taken."""
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """Events that a recording has given."""
+
+    samples: list[MotionSample]
+    frame: StereoFrame | None  # after them; None: at the end
+    ms: float  # for which they were waited
+
+
+def _read(events: Iterable[Event]) -> Iterator[_Read]:
+    """Yield each frame with the samples since the one before it."""
+    samples: list[MotionSample] = []
+    start = time.perf_counter()
+    for event in events:
         if isinstance(event, StereoFrame):
-            self.frame_ns = event.time_ns
-            self.next_frame = event.index
+            yield _Read(samples, event, 1e3 * (time.perf_counter() - start))
+            samples = []
+            start = time.perf_counter()
         else:
-            self.sample_ns = event.time_ns
+            samples.append(event)
+    yield _Read(samples, None, 1e3 * (time.perf_counter() - start))
 
 
 class _Loop:
@@ -406,17 +423,12 @@ class _Loop:
         monitor = processor.pipeline.monitor
         stopped = None
         resumed = state.frame_ns is not None
-        for event in self._timed(events):
-            if resumed and not state.is_new(event):
-                continue
-            if isinstance(event, StereoFrame):
-                if event.index not in self._frames:
-                    continue
-                state.unread += self._between(
-                    state.next_frame + (state.frame_ns is not None), event.index
-                )
-            self._take(event)
-            state.note(event)
+        for read in _read(state.not_taken(events) if resumed else events):
+            if read.samples:
+                self._take_samples(read.samples)
+            self._read_ms += read.ms
+            if read.frame is not None and read.frame.index in self._frames:
+                self._take_frame(read.frame)
             if _MIN_REFUSED <= monitor.frames_refused > len(recorder):
                 break
             stopped = should_stop()
@@ -437,33 +449,33 @@ class _Loop:
             raise DataError(f"most frames were refused: {monitor.refusal}")
         return stopped
 
-    def _timed(self, events: Iterable[Event]) -> Iterator[Event]:
-        """Yield the events, and note how long each took to come."""
-        iterator = iter(events)
-        while True:
-            start = time.perf_counter()
-            event = next(iterator, None)
-            self._read_ms += 1e3 * (time.perf_counter() - start)
-            if event is None:
-                return
-            yield event
-
     def _between(self, first: int, end: int) -> list[int]:
         """Frames `first <= index < end` that the run is to take."""
         return [index for index in range(first, end) if index in self._frames]
 
-    def _take(self, event: Event) -> None:
+    def _take_samples(self, samples: list[MotionSample]) -> None:
         state = self._state
-        if not isinstance(event, StereoFrame):
-            self._recorder.sample(event)
-        results = state.processor.add(event)
-        monitor = state.processor.pipeline.monitor
+        self._recorder.take_samples(samples)
+        self._take_results(state.processor.add_samples(samples))
+        if state.dead_reckoning is not None:
+            for sample in samples:
+                state.dead_reckoning.add(sample)
+        state.sample_ns = samples[-1].time_ns
+
+    def _take_frame(self, frame: StereoFrame) -> None:
+        state = self._state
+        begun = state.frame_ns is not None
+        state.unread += self._between(state.next_frame + begun, frame.index)
+        self._take_results(state.processor.add(frame))
+        state.frame_ns = frame.time_ns
+        state.next_frame = frame.index
+
+    def _take_results(self, results: list[FrameResult]) -> None:
+        monitor = self._state.processor.pipeline.monitor
         if monitor.ends_at_shifted_pairs and monitor.pairs_shifted_by:
             raise _PairsShiftedError(monitor.pairs_shifted_by)
         if results:
             self._record(results)
-        if state.dead_reckoning is not None:
-            state.dead_reckoning.add(event)
 
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state
@@ -563,11 +575,10 @@ class DeadReckoning:
         self._filter = Vislam(camera, T_cam0_body, settings, motion_sensor=True)
         self._begun = False
 
-    def add(self, event: Event) -> None:
+    def add(self, sample: MotionSample) -> None:
         """Take a motion sample."""
-        if not isinstance(event, StereoFrame):
-            self._filter.propagate(event)
-            self._begun = True
+        self._filter.propagate(sample)
+        self._begun = True
 
     def pose_at(self, time_ns: int) -> FloatArray:
         """The pose (4, 4) of the body at a frame, which may not be older than the last one."""

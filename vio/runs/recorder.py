@@ -56,7 +56,7 @@ from vio.runs.tables import (
     observation_rows,
     observations_of,
     sample_of,
-    sample_row,
+    sample_rows,
 )
 
 log = logging.getLogger(__name__)
@@ -122,15 +122,15 @@ class RunRecorder:
 
     # What goes in
 
-    def sample(self, sample: MotionSample) -> None:
-        """Take a motion sample."""
+    def take_samples(self, samples: Sequence[MotionSample]) -> None:
+        """Take motion samples."""
         if not self._keep:
             return
         if self._tables:
             with self._writing():
-                self._tables["samples"].append(sample_row(sample))
+                self._tables["samples"].append(sample_rows(samples))
         else:
-            self._early.append(sample_row(sample))
+            self._early.append(sample_rows(samples))
 
     def dead_reckoning(self, T_world_body: FloatArray) -> None:
         """Take the pose (4, 4) of a frame by dead reckoning, after the frame itself."""

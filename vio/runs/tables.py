@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from vio.datasets.samples import motion_samples
 from vio.files.tables import Rows, Table
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
@@ -214,19 +215,14 @@ def observations_of(row: np.void, table: Table, end: int) -> Observations:
     return Observations(int(row["index"]), int(row["time_ns"]), *columns)
 
 
-def sample_row(sample: MotionSample) -> Rows:
-    """Return a motion sample as a row (1,)."""
-    row = np.zeros(1, dtype=SAMPLE)
-    imu = isinstance(sample, ImuSample)
-    halves = (
-        (sample.gyro, sample.accel)
-        if isinstance(sample, ImuSample)
-        else (sample.linear, sample.angular)
-    )
-    row["time_ns"] = sample.time_ns
-    row["is_imu"] = imu
-    row["values"] = np.concatenate(halves)
-    return row
+def sample_rows(samples: Sequence[MotionSample]) -> Rows:
+    """Return motion samples as rows (N,)."""
+    arrays = motion_samples(samples)
+    rows = np.zeros(len(arrays), dtype=SAMPLE)
+    rows["time_ns"] = arrays.times_ns
+    rows["is_imu"] = arrays.is_imu
+    rows["values"] = arrays.values
+    return rows
 
 
 def sample_of(row: np.void) -> MotionSample:

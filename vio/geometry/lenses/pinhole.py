@@ -21,7 +21,11 @@ _MIN_DEPTH = 1e-9
 def pinhole(p: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Tangents (..., 2) of points (..., 3), and a mask (...) of those before the camera."""
     valid = np.greater(p[..., 2], _MIN_DEPTH)
-    return p[..., :2] / np.where(valid, p[..., 2], 1.0)[..., None], valid
+    depth = np.where(valid, p[..., 2], 1.0)
+    tangents = np.empty((*p.shape[:-1], 2))
+    np.divide(p[..., 0], depth, out=tangents[..., 0])
+    np.divide(p[..., 1], depth, out=tangents[..., 1])
+    return tangents, valid
 
 
 def pinhole_by_point(p: FloatArray) -> FloatArray:

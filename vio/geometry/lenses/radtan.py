@@ -125,12 +125,19 @@ def _rational_max_radius(above: tuple[float, ...], below: tuple[float, ...]) -> 
     return float(np.sqrt(min(positive))) if positive else np.inf
 
 
+def _radius(xy: FloatArray) -> FloatArray:
+    """Distance (...) of points (..., 2) from the origin."""
+    x = xy[..., 0]
+    y = xy[..., 1]
+    return np.sqrt(x * x + y * y)
+
+
 def distorted(c: Coefficients, xy: FloatArray, valid: BoolArray) -> tuple[FloatArray, BoolArray]:
     """Return points (..., 2) with distortion, and which of the valid ones (...) are inside the
     model's radius; the others' values are finite.
     """
-    valid = valid & (np.linalg.norm(xy, axis=-1) < max_radius(c))
-    return distort(c, np.where(valid[..., None], xy, 0.0)), valid
+    valid = valid & (_radius(xy) < max_radius(c))
+    return distort(c, xy if valid.all() else np.where(valid[..., None], xy, 0.0)), valid
 
 
 def undistort(c: Coefficients, target: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -138,7 +145,8 @@ def undistort(c: Coefficients, target: FloatArray) -> tuple[FloatArray, BoolArra
     xy = np.where(np.isfinite(target), target, 0.0)
     goal = xy
     for _ in range(_NEWTON_STEPS):
-        residual = distort(c, xy) - goal
+        now = distort(c, xy)
+        residual = now - goal
         if np.abs(residual).max(initial=0.0) < _NEWTON_TOLERANCE:
             break
         J = distort_by_xy(c, xy)
@@ -147,10 +155,11 @@ def undistort(c: Coefficients, target: FloatArray) -> tuple[FloatArray, BoolArra
         step = np.empty(xy.shape)
         step[..., 0] = J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1]
         step[..., 1] = J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]
-        xy = xy - np.clip(step / det[..., None], -0.5, 0.5)
-    found = np.linalg.norm(distort(c, xy) - target, axis=-1) < 1e-8
-    radius = np.linalg.norm(xy, axis=-1)
-    return xy, np.logical_and(found, radius < max_radius(c))
+        xy = xy - np.minimum(np.maximum(step / det[..., None], -0.5), 0.5)
+    else:
+        now = distort(c, xy)
+    found = _radius(now - target) < 1e-8
+    return xy, np.logical_and(found, _radius(xy) < max_radius(c))
 
 
 class RadialTangential(Lens):
