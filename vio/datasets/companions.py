@@ -250,7 +250,7 @@ def _read_motion(
         notes += [*notes_read, *notes_moved]
         parts.append(samples)
     if velocity.is_file():
-        speeds = read_velocity_table(velocity)
+        speeds = read_velocity_table(velocity, notes)
         check_overlap(times_ns, speeds.times_ns, velocity)
         parts.append(speeds)
     return in_time_order(*parts), files, notes
