@@ -117,3 +117,80 @@ def test_nanoseconds_without_their_zeros_are_said_to_be(where: str, tmp_path: Pa
 def test_decimals_of_any_length_are_no_nanoseconds() -> None:
     texts = ["3.9", "4", "4.05", "4.1", "4.15", "4.2"]
     assert parse_stamps(texts, str).tolist() == [round(float(t) * 1e9) for t in texts]
+
+
+def test_names_whose_nanoseconds_lack_their_zeros_are_said_to(tmp_path: Path) -> None:
+    """Without an IMU they were numbers of frames 0.1 s apart."""
+    name = lambda side, k: f"1700000000.{50_000_000 * k + 12_000_000}.png"  # noqa: E731
+    folder = make_plain(tmp_path, name=name, times=False, imu=False)
+    with pytest.raises(DataError, match=r"lack their leading zeros.*write 1700000000\.012000000"):
+        open_dataset(folder)
+
+
+def test_names_whose_last_zeros_were_cut_are_times(tmp_path: Path) -> None:
+    ns = [1700000000_000000000 + 37_512_000 * k for k in range(6)]
+    name = lambda side, k: f"{ns[k] // 10**9}.{ns[k] % 10**9:09d}".rstrip("0") + ".png"  # noqa: E731
+    folder = make_plain(tmp_path, 6, name=lambda s, k: name(s, k).replace("..", "."), times=False)
+    assert open_dataset(folder).recording.frame_times_ns.tolist() == ns
+
+
+def _named(folder: Path, name: Callable[[int], str]) -> list[int]:
+    made = make_plain(folder, name=lambda _, k: f"{name(k)}.png", times=False)
+    return open_dataset(made).recording.frame_times_ns.tolist()
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "2024-05-12_14-{0}-{1}-{2:03d}000",
+        "2024-05-12T14:{0}:{1}.{2:03d}000000Z",
+        "20240512_14{0}{1}_{2:03d}",
+        "left_2024051214{0}{1}{2:03d}",
+        "2024051214{0}{1}{2:03d}000",
+    ],
+)
+def test_names_may_be_dates(form: str, tmp_path: Path) -> None:
+    """They were counted at 10 Hz, or read as milliseconds with a leap at each minute."""
+    seconds = [59.96, 60.01, 60.06, 60.11]
+    name = lambda k: form.format(  # noqa: E731
+        f"{3 + int(seconds[k]) // 60:02d}",
+        f"{int(seconds[k]) % 60:02d}",
+        round(1000 * (seconds[k] % 1)),
+    )
+    made = make_plain(
+        tmp_path, name=lambda _, k: f"{name(k)}.png", times=False, imu=False, reference=False
+    )
+    times_ns = open_dataset(made).recording.frame_times_ns
+    assert np.diff(times_ns).tolist() == [50_000_000] * 3
+    assert times_ns[1] == np.datetime64("2024-05-12T14:04:00.010", "ns").astype(np.int64)
+
+
+def test_a_stamp_behind_the_number_of_the_frame_is_its_time(tmp_path: Path) -> None:
+    ns = [1700000000_000000000 + 50_000_000 * k for k in range(4)]
+    assert _named(tmp_path, lambda k: f"{k:06d}_{ns[k]}") == ns
+
+
+def test_a_date_and_a_number_are_no_stamp(tmp_path: Path) -> None:
+    made = make_plain(
+        tmp_path, name=lambda _, k: f"240512_{10_000_000_000 + k}.png", times=False, imu=False
+    )
+    assert np.diff(open_dataset(made).recording.frame_times_ns).tolist() == [100_000_000] * 3
+
+
+def test_lists_of_times_may_be_dates_of_iso_8601(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, imu=False)
+    lines = [f"2023-11-14T22:13:20.{50 * k:03d}Z" for k in range(4)]
+    (folder / "times.txt").write_text("\n".join(lines) + "\n")
+    times_ns = open_dataset(folder).recording.frame_times_ns
+    assert times_ns.tolist() == [1700000000_000000000 + 50_000_000 * k for k in range(4)]
+
+
+@pytest.mark.parametrize(("first", "doubted"), [(97, True), (90, False)])
+def test_a_counter_that_began_again_is_doubted(first: int, doubted: bool, tmp_path: Path) -> None:
+    """Images 97, 98, 99, 00, 01 … in the order of their numbers begin with 00."""
+    folder = make_plain(
+        tmp_path, 6, name=lambda _, k: f"img{(first + k) % 100:02d}.png", times=False, imu=False
+    )
+    doubts = [note for note in open_dataset(folder).recording.notes if "doubtful" in note]
+    assert len(doubts) == doubted
+    assert all("img97.png is the first image" in doubt for doubt in doubts)

@@ -15,6 +15,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.datasets.common import check_gravity_column
+from vio.datasets.dates import date_ns
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.files.stamps import SAMPLE_PACE, Pace, parse_stamps
@@ -332,14 +333,23 @@ def _without_gaps(
     return _rows(table, kept), times_ns[kept]
 
 
+def holds_readings(path: Path) -> bool:
+    """Return whether a file could be an IMU's by its first line of data."""
+    try:
+        return _columns(path) >= _IMU_COLUMNS
+    except DataError:
+        return False
+
+
+def _columns(path: Path) -> int:
+    """Return the number of columns of a table; 0: it holds no line of data."""
+    rows = (split_cells(line.strip()) for _, line in lines_of(path))
+    return next((len(fields) for fields in rows if _NUMBER.fullmatch(fields[0])), 0)
+
+
 def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
     """Read the stamps and six readings, or what the header names of more columns."""
-    count = 0
-    for _, line in lines_of(path):
-        fields = split_cells(line.strip())
-        if _NUMBER.fullmatch(fields[0]):
-            count = len(fields)
-            break
+    count = _columns(path)
     if count <= _IMU_COLUMNS:
         return read_table(path, _IMU_COLUMNS, _IMU_FORM, cut)
     table = _joined_stamps(read_table(path, count, _IMU_FORM, cut))
@@ -484,10 +494,6 @@ def _finite(table: NumberTable) -> FloatArray:
     return table.values
 
 
-# whose nanoseconds fit 64 bits
-_DATE = re.compile(r"(19|20|21)\d\d-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{0,9})?")
-
-
 def is_date(text: str) -> bool:
     """Whether a line begins as '2011-09-26 14:02:25' does."""
     return re.match(r"\d{4}-\d{2}-\d{2}[ T]", text.strip()) is not None
@@ -520,11 +526,9 @@ def drive_times(path: Path, numbers: IntArray) -> IntArray:
 def _parse_date(text: str, path: Path, number: int) -> int:
     """Parse '2011-09-26 14:02:25.951199337' as UTC, to nanoseconds since 1970."""
     try:
-        if not _DATE.fullmatch(text.strip()):
-            raise ValueError(text)
-        return int(np.datetime64(text.strip().rstrip("."), "ns").astype(np.int64))
+        return date_ns(text)
     except ValueError as error:
         raise DataError(
             f"{path}, line {number}: {text.strip()[:40]!r} is no time of the form '2011-09-26 "
-            "14:02:25.951199337'"
+            "14:02:25.951199337' in UTC"
         ) from error

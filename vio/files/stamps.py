@@ -95,6 +95,24 @@ def parse_stamps(
     return check_increasing(times_ns, where) if increasing else times_ns
 
 
+def check_digits(texts: Sequence[str], where: Callable[[int], str]) -> None:
+    """Raise DataError where nanoseconds were put behind the points of names, in any order, without
+    their leading zeros.
+
+    Names whose zeros at the end were cut differ in length, too, and none ends with one.
+    """
+    ends = [text.partition(".")[2] for text in texts]
+    zeros = [k for k, end in enumerate(ends) if len(end) > 1 and end.endswith("0")]
+    shorter = [k for k in zeros if len(ends[k]) < max(map(len, ends))]
+    if shorter:
+        k = shorter[0]
+        whole = texts[k].partition(".")[0]
+        raise DataError(
+            f"{where(k)}: nanoseconds lack their leading zeros, as decimals of different length do "
+            f"that end with a zero; write {whole}.{int(ends[k]):09d} for {texts[k]}"
+        )
+
+
 def _check_leading_zeros(
     texts: Sequence[str], times_ns: IntArray, where: Callable[[int], str]
 ) -> None:
