@@ -366,7 +366,7 @@ BAD = {
         r"imu\.csv: needs the pose of its sensor; add T_cam0_imu",
     ),
     "unsorted IMU stamps": (
-        _edit("imu.csv", "1699999999995000000", "1699999999985000000"),
+        _edit("imu.csv", "1699999999995000000", "1699999999989000000"),
         "runs backwards",
     ),
     "an IMU of another epoch": (

@@ -220,6 +220,34 @@ def test_intrinsics_in_another_order_are_doubted(tmp_path: Path) -> None:
     assert "check the order" in doubt
 
 
+def _kitti_note(folder: Path, scale: float) -> list[str]:
+    c = [scale * value for value in (700.0, 640.0, 360.0)]
+    P = lambda shift: f"{c[0]} 0 {c[1]} {shift} 0 {c[0]} {c[2]} 0 0 0 1 0"  # noqa: E731
+    (folder / "calib.txt").write_text(f"P0: {P(0)}\nP1: {P(-70)}\n")
+    return list(vio.load_rig(folder / "calib.txt", image_size=(1280, 720)).notes)
+
+
+def test_a_principal_point_of_a_little_larger_images_is_noted_and_not_doubted(
+    tmp_path: Path,
+) -> None:
+    """Real ones are off by as much."""
+    assert _kitti_note(tmp_path, 1.015) == []
+    for scale, size in ((1.03, "1318 x 742"), (1 / 1.04, "1231 x 692")):
+        (note,) = _kitti_note(tmp_path, scale)
+        assert "doubtful" not in note
+        assert f"images of about {size} pixels, lengths are off by as much" in note
+    (doubt,) = _kitti_note(tmp_path, 1.06)
+    assert "doubtful" in doubt
+
+
+def test_tabs_in_a_calibration_are_named_with_what_to_do(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    file = folder / "camchain-imucam.yaml"
+    file.write_text(file.read_text().replace("  camera_model", "\tcamera_model"))
+    with pytest.raises(CalibrationError, match="replace tabs by spaces"):
+        vio.load_rig(file)
+
+
 def test_a_lever_arm_in_millimetres_is_doubted(tmp_path: Path) -> None:
     folder = make_plain(tmp_path)
     rig = vio.load_rig(folder)

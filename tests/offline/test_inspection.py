@@ -168,6 +168,13 @@ def _shifted_rows(folder: Path) -> None:
         assert cv2.imwrite(str(file), np.roll(image, 6, axis=0))
 
 
+def _turned(folder: Path) -> None:
+    for file in (folder / "mav0" / "cam1" / "data").iterdir():
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        assert cv2.imwrite(str(file), image[::-1, ::-1])
+
+
 FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "accelerometer in g": (
         _imu(_scaled_accel),
@@ -184,6 +191,10 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "exchanged cameras": (
         _swapped,
         "stereo: .* left and right images are exchanged; exchange the folders",
+    ),
+    "right camera upside down": (
+        _turned,
+        "stereo: the right images are turned by about 180 degrees against the left ones: turn them",
     ),
     "one camera twice": (_same, "images: left and right are the same images"),
     "rows shifted": (

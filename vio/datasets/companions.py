@@ -21,7 +21,7 @@ from vio.datasets.rigs.eth3d import EXTRINSICS, FOLDERS, is_eth3d, truth_of_left
 from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transform
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.tables import read_imu_table, read_velocity_table
+from vio.datasets.tables import holds_readings, read_imu_table, read_velocity_table
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
 from vio.files.trajectories import read_trajectory
@@ -229,8 +229,9 @@ def _read_motion(
     )
     velocity = layout.root / "velocity.csv"
     files = [f for f in (imu, velocity) if f is not None and f.is_file()]
+    others = _other_imu_notes(layout) if imu is None else []
     if not files:
-        return in_time_order(), [], []
+        return in_time_order(), [], others
     if not timed:
         raise DataError(
             f"{files[0]}: needs the times of the images on the same clock; add times.txt, or "
@@ -243,17 +244,25 @@ def _read_motion(
             "with T_cam_imu (Kalibr's camchain-imucam), or remove the file to use the images alone"
         )
     parts: list[Sequence[MotionSample]] = []
-    notes: list[str] = []
+    notes = others
     if imu is not None:
         record, notes_read = read_imu_table(imu, cut=notes)
         samples, notes_moved = imu_on_camera_clock(record, rig, times_ns, imu)
         notes += [*notes_read, *notes_moved]
         parts.append(samples)
     if velocity.is_file():
-        speeds = read_velocity_table(velocity)
+        speeds = read_velocity_table(velocity, notes)
         check_overlap(times_ns, speeds.times_ns, velocity)
         parts.append(speeds)
     return in_time_order(*parts), files, notes
+
+
+def _other_imu_notes(layout: Layout) -> list[str]:
+    """Say how to name a table that seems to be the IMU's and is not read by its name."""
+    folders = dict.fromkeys((layout.root, layout.base))
+    files = [f for folder in folders for f in sorted(folder.glob("*[iI][mM][uU]*")) if f.is_file()]
+    found = [f for f in files if f.suffix.lower() in (".csv", ".txt") and holds_readings(f)]
+    return [f"{f}: not read; name it imu.csv if it is the IMU's" for f in found]
 
 
 def _read_reference(

@@ -12,7 +12,7 @@ from vio.datasets.bags.store import Bag
 from vio.datasets.gnss_fixes import UP_SHARE, GnssFixes, checked_fixes
 from vio.datasets.tables import drive_times, read_table, stamps_ns
 from vio.errors import DataError
-from vio.files.text import text_lines
+from vio.files.text import check_increasing, text_lines
 
 _FORM = "time_s,latitude_deg,longitude_deg,height_m,sigma_east_m,sigma_north_m,sigma_up_m"
 _OXTS_COLUMNS = 30
@@ -58,9 +58,8 @@ def _read_csv(path: Path) -> GnssFixes:
     sigmas = values[:, 3:].copy() if columns == 7 else np.full((len(values), 3), np.nan)
     no_up = np.isnan(sigmas[:, 2])
     sigmas[no_up, 2] = UP_SHARE * sigmas[no_up, :2].max(axis=1)
-    return checked_fixes(
-        stamps_ns(table), values[:, :3], np.eye(3) * sigmas[:, None, :] ** 2, str(path)
-    )
+    times_ns = check_increasing(stamps_ns(table), table.where)
+    return checked_fixes(times_ns, values[:, :3], np.eye(3) * sigmas[:, None, :] ** 2, str(path))
 
 
 def _read_oxts(folder: Path) -> GnssFixes:

@@ -13,14 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.datasets.dates import dates_in_names
 from vio.datasets.frame_times import PAIRED_NS, nearest, pair_stamps
-from vio.datasets.image_files import FilePairs, ImageFiles
+from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImagePairs
+from vio.datasets.images import list_images
 from vio.datasets.sides import without_side
 from vio.datasets.tables import drive_times, is_date, table_rows
 from vio.datasets.unused import Layout
 from vio.errors import DataError
-from vio.files.stamps import FRAME_PACE, parse_stamps
+from vio.files.stamps import FRAME_PACE, check_digits, parse_stamps
 from vio.files.text import text_lines
 from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
 from vio.records import NS_PER_S, IntArray
@@ -29,9 +31,11 @@ _SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 _LIST_FORM = "timestamp [ns], filename"
 _NUMBER = r"\d+(?:\.\d*)?(?:[eE][+-]?\d+)?"
-# `cam0_1403636579763555584`, `1403636579763555584_left`, `1700000001.33713`, `17000000013371ms`
+# `cam0_1403636579763555584`, `1403636579763555584_left`, `1700000001.33713`, `17000000013371ms`,
+# and `000012_1403636579763555584`, with the number of the frame
 _STAMP = re.compile(
-    r"(?:[A-Za-z]+\d?[_-])?(?P<time>\d{10,19}|\d{1,10}\.\d{1,9})(?:_?(?P<unit>ns|us|ms|s))?"
+    r"(?:(?:[A-Za-z]+\d?|(?P<number>\d{1,7}))[_-])?"
+    r"(?P<time>\d{10,19}|\d{1,10}\.\d{1,9})(?:_?(?P<unit>ns|us|ms|s))?"
     r"(?:[_-][A-Za-z]+\d?)?"
 )
 # Since 1970: milliseconds to nanoseconds, or seconds with a point.
@@ -66,9 +70,69 @@ def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple
             f"{rights[0].name}); give both images of a pair the same name or number"
         )
     alone = len(lefts) - len(pairs), len(rights) - len(pairs)
+    rolled = rolled_doubt(lefts)
     if not any(alone):
-        return pairs, ()
-    return pairs, (f"{alone[0]} left and {alone[1]} right images have no partner and are skipped",)
+        return pairs, rolled
+    skipped = f"{alone[0]} left and {alone[1]} right images have no partner and are skipped"
+    return pairs, (skipped, *rolled, *_shift_doubt(lefts, rights, rows))
+
+
+def rolled_doubt(files: ImageFiles) -> tuple[str, ...]:
+    """Doubt the order of images whose numbers are 0 and the largest of their digits, with one hole
+    between them: as of a counter that began again at 0.
+    """
+    numbers = [re.findall(r"\d+", stem_of(name))[-1:] for name in files.names]
+    widths = {len(number[0]) for number in numbers if number}
+    if len(widths) != 1 or not all(numbers):
+        return ()
+    width = widths.pop()
+    found = np.array([int(number[0]) for number in numbers])
+    steps = np.diff(found)
+    if found[0] != 0 or found[-1] != 10**width - 1 or (steps <= 0).any():
+        return ()
+    usual = int(np.median(steps))
+    holes = np.flatnonzero(steps != usual)
+    if len(holes) != 1:
+        return ()
+    last, first = (files.names[int(holes[0]) + k] for k in (0, 1))
+    return (
+        f"{files.folder}: doubtful: images are taken in the order of their numbers, which lack those "
+        f"between {last} and {first}; if the counter began again at 0, {first} is the first image: "
+        "number them on",
+    )
+
+
+def _shift_doubt(
+    lefts: ImageFiles, rights: ImageFiles, rows: Sequence[tuple[int, int]]
+) -> tuple[str, ...]:
+    """Doubt pairs of equal numbers, not of equal times, where the first images of one camera and the
+    last of the other have no partner, and no others: as where each counts its own from another
+    number.
+
+    Args:
+        lefts: all left images, in order.
+        rights: all right images, in order.
+        rows: the left and the right image of each pair.
+    """
+    first = rows[0]
+    last = rows[-1]
+    before = first[0], first[1]
+    after = len(lefts) - 1 - last[0], len(rights) - 1 - last[1]
+    shifted = (before[0] and after[1] and not (before[1] or after[0])) or (
+        before[1] and after[0] and not (before[0] or after[1])
+    )
+    held = len(lefts) - len(rows) == before[0] + after[0]
+    held = held and len(rights) - len(rows) == before[1] + after[1]
+    if not (shifted and held) or _name_times(lefts) is not None:
+        return ()
+    early, late = ("left", "right") if before[0] else ("right", "left")
+    frames = max(before)
+    apart = "a frame" if frames == 1 else f"{frames} frames"
+    return (
+        f"{lefts.folder} and {rights.folder}: doubtful: images of one number are paired, and the "
+        f"first {frames} {early} and the last {max(after)} {late} ones have none; if each camera "
+        f"counts its own images, those of a pair are {apart} apart: give them one number",
+    )
 
 
 def _check_stamps_apart(lefts: ImageFiles, rights: ImageFiles) -> None:
@@ -120,16 +184,25 @@ def _name_times(
         files: the images.
         doubts: where to note a unit that how far apart the frames are decided.
         since_1970_alone: whether other numbers, as those since a boot, are no times.
+
+    Raises:
+        DataError: nanoseconds lack their leading zeros.
     """
+    dates_ns = dates_in_names([file.stem for file in files])
+    if dates_ns is not None:
+        return dates_ns if (np.diff(dates_ns) > 0).all() else None
     found = [_STAMP.fullmatch(file.stem) for file in files]
     texts = [match["time"] for match in found if match is not None]
     units = {match["unit"] for match in found if match is not None}
     if len(texts) < len(files) or len(units) != 1:
         return None
+    since_1970_alone = since_1970_alone or any(match and match["number"] for match in found)
     unit = units.pop()
     stated = None if unit is None else TIME_UNITS[unit]
     seconds = any("." in text for text in texts) and all(map(_SECONDS.fullmatch, texts))
     since_1970 = seconds or all(map(_SINCE_1970.fullmatch, texts))
+    if seconds:
+        check_digits(texts, lambda k: str(files[k]))
     boot = stated is not None or _could_be_times(texts)
     if not since_1970 and (since_1970_alone or not boot):
         return None
@@ -262,6 +335,8 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
         chosen = found
     elif len(rows) == len(pairs) and all(len(fields) == 1 for _, fields in rows):
         chosen = [(n, fields[0]) for n, fields in rows]
+    elif (of_all := _of_all_images(rows, pairs)) is not None:
+        chosen = of_all
     else:
         raise DataError(
             f"{file} holds {len(rows)} times for {len(pairs)} image pairs; there must be one time "
@@ -296,6 +371,22 @@ def _by_number_or_time_first(
         return [by_number[int(number)] for number in numbers]
     counted = sorted(by_number) == list(range(min(by_number), min(by_number) + len(pairs)))
     return [by_number[k] for k in sorted(by_number)] if counted else None
+
+
+def _of_all_images(
+    rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs
+) -> list[tuple[int, str]] | None:
+    """Return line and time of each pair where there is a line for each image of one camera, of which
+    some have no partner; None: there is not.
+    """
+    if not isinstance(pairs, FilePairs) or any(len(fields) != 1 for _, fields in rows):
+        return None
+    for side in (0, 1):
+        row_of = {name: k for k, name in enumerate(list_images(pairs[0][side].parent).names)}
+        if len(row_of) == len(rows):
+            chosen = [rows[row_of[pair[side].name]] for pair in pairs]
+            return [(n, fields[0]) for n, fields in chosen]
+    return None
 
 
 def time_lines(file: Path) -> tuple[list[tuple[int, list[str]]], str | None]:

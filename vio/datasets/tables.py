@@ -15,6 +15,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.datasets.common import check_gravity_column
+from vio.datasets.dates import date_ns
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.files.stamps import SAMPLE_PACE, Pace, parse_stamps
@@ -33,7 +34,7 @@ from vio.files.units import (
 )
 from vio.geometry.lie import FloatArray
 from vio.imu.sampling import sampling_notes
-from vio.records import NS_PER_S, ImuRecord, IntArray, VelocitySample
+from vio.records import NS_PER_S, BoolArray, ImuRecord, IntArray, VelocitySample
 
 _NUMBER = re.compile(
     r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE
@@ -43,6 +44,8 @@ _NANOSECONDS = re.compile(r"n(ano)?secs?$|nanoseconds?$")
 _PLAIN = re.compile(r"[0-9.eE+-]*")  # numbers in these are written as `_NUMBER` says, or are none
 _IMU_COLUMNS = 7
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
+_MAX_LATE = 0.05  # share of lines that may have been written late
+_OWN_PLACE = 0.5  # of the usual interval that is free on both sides of such a line
 _OTHER_UNITS = {"rad/s": "deg/s or mdps", "m/s^2": "g or mg"}  # for messages
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 
@@ -98,15 +101,18 @@ def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[st
     lines = [number for number, _ in rows]
     stamps = [fields[0] for _, fields in rows]
     stated = time_unit(header[0]) if header else None
-    times_ns = _times_ns(stamps, lambda k: f"{path}, line {lines[k]}", stated)
+    where = lambda k: f"{path}, line {lines[k]}"  # noqa: E731
+    times_ns = _times_ns(stamps, where, stated, increasing=True)
     return times_ns, [fields[-1] for _, fields in rows], lines
 
 
-def _times_ns(stamps: Sequence[str], where: Callable[[int], str], stated: str | None) -> IntArray:
+def _times_ns(
+    stamps: Sequence[str], where: Callable[[int], str], stated: str | None, *, increasing: bool
+) -> IntArray:
     """Return times (N,) that are whole nanoseconds where no other unit is stated."""
     if stated in (None, "ns"):
-        return whole_ns_stamps(stamps, where)
-    return parse_stamps(stamps, where, stated)
+        return whole_ns_stamps(stamps, where, increasing=increasing)
+    return parse_stamps(stamps, where, stated, increasing=increasing)
 
 
 def table_rows(
@@ -135,6 +141,7 @@ def table_rows(
         DataError: the file cannot be read or is empty, or a line has another number of columns.
     """
     header = list[str]()
+    named = ""  # the header, as it is written
     unread = ""
     is_data = False
     lines = lines_of(path)
@@ -148,8 +155,11 @@ def table_rows(
                 cells = header_cells(text, columns)
                 if cells:
                     header = _with_units(header, cells)
+                    named = text.lstrip("# ")
                 elif comments is not None:
                     comments.append(text)
+            continue
+        if text == named:  # again, in a file that another was appended to
             continue
         if len(fields) != columns:
             if cut is not None and is_data and len(fields) < columns and next(lines, None) is None:
@@ -187,8 +197,8 @@ def _with_units(header: list[str], cells: list[str]) -> list[str]:
 def stamps_ns(
     table: NumberTable, pace: Pace | None = None, doubts: list[str] | None = None
 ) -> IntArray:
-    """Return the first column as nanoseconds (N,), strictly increasing; the unit as stated, else by
-    its size.
+    """Return the first column as nanoseconds (N,), in any order; the unit as stated, else by its
+    size.
 
     Args:
         table: the file's.
@@ -196,9 +206,62 @@ def stamps_ns(
         doubts: where to note a unit that the pace decided.
 
     Raises:
-        DataError: a stamp is no number, or not later than the one before.
+        DataError: a stamp is no number.
     """
-    return parse_stamps(table.stamps, table.where, _stated_unit(table), pace=pace, doubts=doubts)
+    unit = _stated_unit(table)
+    return parse_stamps(table.stamps, table.where, unit, pace=pace, doubts=doubts, increasing=False)
+
+
+def in_order(
+    table: NumberTable, times_ns: IntArray, notes: list[str]
+) -> tuple[NumberTable, IntArray]:
+    """Return a table and its times (N,), which strictly increase, without lines that repeat the one
+    above, and with those in their place that were written late; both are noted.
+
+    A late line fits between two others. After a clock was set back lines do not, or there are more
+    of them.
+
+    Raises:
+        DataError: the times do not increase otherwise.
+    """
+    if not (np.diff(times_ns) <= 0).any():
+        return table, times_ns
+    repeats = np.zeros(len(times_ns), dtype=np.bool_)
+    repeats[1:] = (np.diff(times_ns) == 0) & (table.values[1:] == table.values[:-1]).all(axis=1)
+    kept = np.flatnonzero(~repeats)
+    if repeats.any():
+        notes.append(
+            f"{table.path}: {int(repeats.sum())} lines repeat the one above and are left out"
+        )
+    times = times_ns[kept]
+    late = times < np.maximum.accumulate(times)
+    if late.any() and _fits(times, late):
+        kept = kept[np.argsort(times, kind="stable")]
+        notes.append(f"{table.path}: {int(late.sum())} lines were written late and are sorted")
+    table = _rows(table, kept)
+    return table, check_increasing(times_ns[kept], table.where)
+
+
+def _fits(times_ns: IntArray, late: BoolArray) -> bool:
+    """Return whether sorted times are further apart than half of the usual, and few were late."""
+    steps = np.diff(np.sort(times_ns))
+    usual = np.median(steps)
+    place = np.searchsorted(np.sort(times_ns), times_ns[late])
+    before = steps[np.maximum(place - 1, 0)]
+    after = steps[np.minimum(place, len(steps) - 1)]
+    own = np.minimum(before, after) > _OWN_PLACE * usual
+    return bool(own.all()) and late.sum() <= _MAX_LATE * len(late)
+
+
+def _rows(table: NumberTable, rows: IntArray) -> NumberTable:
+    """Return some lines of a table."""
+    kept = rows.tolist()
+    return replace(
+        table,
+        stamps=tuple(table.stamps[k] for k in kept),
+        values=table.values[rows],
+        lines=[table.lines[k] for k in kept],
+    )
 
 
 def _stated_unit(table: NumberTable) -> str | None:
@@ -229,10 +292,12 @@ def read_imu_table(
     table = _imu_table(path, cut)
     notes: list[str] = []
     if whole_ns:
-        times_ns = _times_ns(table.stamps, table.where, _stated_unit(table))
+        unit = _stated_unit(table)
+        times_ns = _times_ns(table.stamps, table.where, unit, increasing=False)
     else:
         times_ns = stamps_ns(table, SAMPLE_PACE, notes)
     table, times_ns = _without_gaps(table, times_ns, notes)
+    table, times_ns = in_order(table, times_ns, notes)
     values = _finite(table)
     order = _imu_order(table)
     if order is None:
@@ -263,25 +328,28 @@ def _without_gaps(
     count = int(lost.sum())
     if not count or 2 * count > len(lost):
         return table, times_ns
-    kept = np.flatnonzero(~lost).tolist()
+    kept = np.flatnonzero(~lost)
     notes.append(f"{table.path}: {count} readings are not numbers and are left out")
-    rest = replace(
-        table,
-        stamps=tuple(table.stamps[k] for k in kept),
-        values=table.values[kept],
-        lines=[table.lines[k] for k in kept],
-    )
-    return rest, times_ns[kept]
+    return _rows(table, kept), times_ns[kept]
+
+
+def holds_readings(path: Path) -> bool:
+    """Return whether a file could be an IMU's by its first line of data."""
+    try:
+        return _columns(path) >= _IMU_COLUMNS
+    except DataError:
+        return False
+
+
+def _columns(path: Path) -> int:
+    """Return the number of columns of a table; 0: it holds no line of data."""
+    rows = (split_cells(line.strip()) for _, line in lines_of(path))
+    return next((len(fields) for fields in rows if _NUMBER.fullmatch(fields[0])), 0)
 
 
 def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
     """Read the stamps and six readings, or what the header names of more columns."""
-    count = 0
-    for _, line in lines_of(path):
-        fields = split_cells(line.strip())
-        if _NUMBER.fullmatch(fields[0]):
-            count = len(fields)
-            break
+    count = _columns(path)
     if count <= _IMU_COLUMNS:
         return read_table(path, _IMU_COLUMNS, _IMU_FORM, cut)
     table = _joined_stamps(read_table(path, count, _IMU_FORM, cut))
@@ -396,8 +464,12 @@ def _sensor(letters: str) -> str:
     return "a" if letters.startswith(("a", "lin")) or "acc" in letters else ""
 
 
-def read_velocity_table(path: Path) -> MotionSamples[VelocitySample]:
+def read_velocity_table(path: Path, notes: list[str]) -> MotionSamples[VelocitySample]:
     """Read body velocity and angular rate in the IMU frame.
+
+    Args:
+        path: the file.
+        notes: where to note lines that are left out or sorted.
 
     Raises:
         DataError: the header or a line is another one, or the clock does not increase.
@@ -405,7 +477,7 @@ def read_velocity_table(path: Path) -> MotionSamples[VelocitySample]:
     table = read_table(path, 7, VELOCITY_HEADER)
     if ",".join(table.header) != VELOCITY_HEADER:
         raise DataError(f"{path}, line 1: expected the header {VELOCITY_HEADER}")
-    times_ns = stamps_ns(table)
+    table, times_ns = in_order(table, stamps_ns(table), notes)
     values = _finite(table)
     return velocity_samples(times_ns, values[:, :3], values[:, 3:])
 
@@ -420,10 +492,6 @@ def _finite(table: NumberTable) -> FloatArray:
             "remove such lines"
         )
     return table.values
-
-
-# whose nanoseconds fit 64 bits
-_DATE = re.compile(r"(19|20|21)\d\d-\d\d-\d\d \d\d:\d\d:\d\d(\.\d{0,9})?")
 
 
 def is_date(text: str) -> bool:
@@ -458,11 +526,9 @@ def drive_times(path: Path, numbers: IntArray) -> IntArray:
 def _parse_date(text: str, path: Path, number: int) -> int:
     """Parse '2011-09-26 14:02:25.951199337' as UTC, to nanoseconds since 1970."""
     try:
-        if not _DATE.fullmatch(text.strip()):
-            raise ValueError(text)
-        return int(np.datetime64(text.strip().rstrip("."), "ns").astype(np.int64))
+        return date_ns(text)
     except ValueError as error:
         raise DataError(
             f"{path}, line {number}: {text.strip()[:40]!r} is no time of the form '2011-09-26 "
-            "14:02:25.951199337'"
+            "14:02:25.951199337' in UTC"
         ) from error

@@ -52,9 +52,10 @@ def read_yaml_file(path: Path, what: str = "the sensor's calibration") -> dict[s
     try:
         entries = _strict_or_lax(text)
     except ValueError as error:
+        tabs = "character '\\t'" in str(error)
+        remedy = "replace tabs by spaces" if tabs else "write plain numbers, or copy it again"
         raise CalibrationError(
-            f"{path}: not a YAML file of plain values ({error}); write plain numbers, or copy it "
-            "again"
+            f"{path}: not a YAML file of plain values ({error}); {remedy}"
         ) from error
     if not isinstance(entries, dict):
         raise CalibrationError(

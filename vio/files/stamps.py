@@ -10,6 +10,7 @@ both.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
@@ -32,6 +33,7 @@ _SIZES: tuple[tuple[TimeUnit, Decimal], ...] = (
     ("ms", Decimal("1e11")),
 )
 _DECADES = 1000.0  # between two units
+_SECONDS_AND_NANOSECONDS = re.compile(r"(\d{1,12})\.(\d{1,9})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,7 @@ def parse_stamps(
     *,
     pace: Pace | None = None,
     doubts: list[str] | None = None,
+    increasing: bool = True,
 ) -> IntArray:
     """Parse stamps (N,) as exact decimals.
 
@@ -68,9 +71,11 @@ def parse_stamps(
         pace: how far apart the entries may be, which decides where no unit is stated; None: the
             size alone decides.
         doubts: where to note that a unit was taken by the pace, with both readings.
+        increasing: whether they must strictly increase.
 
     Raises:
-        DataError: a stamp is no number, or not later than the one before.
+        DataError: a stamp is no number, or not later than the one before, or its nanoseconds lack
+            their leading zeros.
     """
     values = [_decimal(text, where, k) for k, text in enumerate(texts)]
     if unit is None:
@@ -82,8 +87,49 @@ def parse_stamps(
         if value.copy_abs() > limit:
             remedy = "divide nanoseconds by 1e9, or state their unit in a header ([ns])"
             raise DataError(f"{where(k)}: {texts[k]!r} is out of range for a time; {remedy}")
-    return check_increasing(
-        [int(value.scaleb(power).to_integral_value()) for value in values], where
+    times_ns = np.array(
+        [int(value.scaleb(power).to_integral_value()) for value in values], dtype=np.int64
+    )
+    if unit == "s":
+        _check_leading_zeros(texts, times_ns, where)
+    return check_increasing(times_ns, where) if increasing else times_ns
+
+
+def check_digits(texts: Sequence[str], where: Callable[[int], str]) -> None:
+    """Raise DataError where nanoseconds were put behind the points of names, in any order, without
+    their leading zeros.
+
+    Names whose zeros at the end were cut differ in length, too, and none ends with one.
+    """
+    ends = [text.partition(".")[2] for text in texts]
+    zeros = [k for k, end in enumerate(ends) if len(end) > 1 and end.endswith("0")]
+    shorter = [k for k in zeros if len(ends[k]) < max(map(len, ends))]
+    if shorter:
+        k = shorter[0]
+        whole = texts[k].partition(".")[0]
+        raise DataError(
+            f"{where(k)}: nanoseconds lack their leading zeros, as decimals of different length do "
+            f"that end with a zero; write {whole}.{int(ends[k]):09d} for {texts[k]}"
+        )
+
+
+def _check_leading_zeros(
+    texts: Sequence[str], times_ns: IntArray, where: Callable[[int], str]
+) -> None:
+    """Raise DataError where nanoseconds were put behind a point without their leading zeros:
+    1700000000.50000000 for 1700000000 s and 50,000,000 ns.
+
+    They go back as decimals, and increase as seconds and nanoseconds.
+    """
+    back = np.flatnonzero(np.diff(times_ns) <= 0)
+    parts = [_SECONDS_AND_NANOSECONDS.fullmatch(text) for text in texts] if len(back) else []
+    found = [(int(part[1]), int(part[2])) for part in parts if part is not None]
+    if len(found) < len(texts) or not found or any(a >= b for a, b in pairwise(found)):
+        return
+    k = int(back[0])
+    raise DataError(
+        f"{where(k)}: the clock runs backwards ({texts[k + 1]} s after {texts[k]} s), as nanoseconds "
+        f"lack their leading zeros; write {found[k][0]}.{found[k][1]:09d} for {texts[k]}"
     )
 
 

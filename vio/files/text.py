@@ -24,6 +24,7 @@ _SIGNED = re.compile(r"([+-]?\d{1,19})(?:\.0*)?")
 # what else than ASCII files of Windows have in units: ° ² ³ µ · ¹ º
 _LATIN = frozenset("°²³µ·¹º")
 _PIECE = 2**16  # characters that are split into lines at a time
+_ROUNDED = 0.05  # share of times that repeat the one before, as rounded ones do
 
 
 def text_lines(path: Path) -> list[tuple[int, str]]:
@@ -146,21 +147,31 @@ def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> In
         what = "repeats" if times[k] == times[k - 1] else "runs backwards"
         now = seconds_text(int(times[k]))
         before = seconds_text(int(times[k - 1]))
-        raise DataError(
-            f"{where(k)}: the clock {what} ({now} s after {before} s); remove or reorder that entry"
+        repeated = int(np.count_nonzero(times[1:] == times[:-1]))
+        remedy = (
+            f"{repeated} of {len(times)} times repeat the one before, as times do that are written "
+            "with too few digits; write all their digits"
+            if repeated > _ROUNDED * len(times)
+            else "remove or reorder that entry"
         )
+        raise DataError(f"{where(k)}: the clock {what} ({now} s after {before} s); {remedy}")
     return times
 
 
 def whole_ns_stamps(
-    texts: Sequence[str], where: Callable[[int], str], *, signed: bool = False
+    texts: Sequence[str],
+    where: Callable[[int], str],
+    *,
+    signed: bool = False,
+    increasing: bool = True,
 ) -> IntArray:
-    """Return stamps (N,) that are written as whole nanoseconds, strictly increasing.
+    """Return stamps (N,) that are written as whole nanoseconds.
 
     Args:
         texts: one stamp each.
         where: returns the place of an entry, for messages.
         signed: whether a sign may stand before them.
+        increasing: whether they must strictly increase.
 
     Raises:
         DataError: a stamp is another number, or not later than the one before.
@@ -173,4 +184,4 @@ def whole_ns_stamps(
             remedy = "write seconds times 1e9, without a point or exponent"
             raise DataError(f"{where(k)}: {text!r} is no time in whole nanoseconds; {remedy}")
         times.append(int(found[1]))
-    return check_increasing(times, where)
+    return check_increasing(times, where) if increasing else np.array(times, dtype=np.int64)

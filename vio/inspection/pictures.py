@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from vio.calibration.stereo import RowResiduals, row_residuals
 from vio.geometry.lie import FloatArray
 from vio.inspection.finding import Part
 from vio.records import Image, StereoFrame
+
+if TYPE_CHECKING:
+    import cv2
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,8 +180,14 @@ def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
             Part("stereo", str(found), {"matches": int(sum(counts))}, [fault] if hopeless else [])
         ]
     off = StereoError(found.rms_px, found.disparity_px)
+    faults = _rows_faults(found)
+    if faults and (turn_deg := _turn_between(frames)):
+        faults = [
+            f"the right images are turned by about {turn_deg} degrees against the left ones: turn "
+            "them back, or calibrate the pair with images as these"
+        ]
     return [
-        Part("stereo", _rows_text(found, counts), _rows_facts(found), _rows_faults(found)),
+        Part("stereo", _rows_text(found, counts), _rows_facts(found), faults),
         Part("calibration", str(off), {"grade": off.grade, "rows_rms_px": off.rows_px}),
     ]
 
@@ -221,8 +231,28 @@ def _rows_faults(found: RowResiduals) -> list[str]:
     return []
 
 
-def sift_pairs(left: Image, right: Image) -> FloatArray:
-    """Match SIFT points of two images: `[ul vl ur vr]` (N, 4) that fit one fundamental matrix."""
+def _turn_between(frames: Sequence[StereoFrame]) -> int:
+    """Return by how many quarter turns, in degrees, the points of right images are turned against
+    those of the left ones; 0: by none, or it is not known.
+
+    Directions of points turn with the image, whatever the calibration says.
+    """
+    turns = [
+        np.array([b.angle - a.angle for a, b in sift_points(f.left, f.right)])
+        for f in frames
+        if f.left is not None and f.right is not None
+    ]
+    all_turns = np.concatenate([np.zeros(0), *turns])
+    if len(all_turns) < _PICTURES.min_matches:
+        return 0
+    quarters = np.round(all_turns / 90).astype(int) % 4
+    counts = np.bincount(quarters, minlength=4)
+    most = int(counts.argmax())
+    return 90 * most if 2 * counts[most] > len(all_turns) else 0
+
+
+def sift_points(left: Image, right: Image) -> list[tuple[cv2.KeyPoint, cv2.KeyPoint]]:
+    """Return the SIFT points of two images that match, whether or not they fit one motion."""
     import cv2
 
     sift = cv2.SIFT_create(_PICTURES.features)  # type: ignore[attr-defined] # missing in OpenCV's stubs
@@ -230,18 +260,23 @@ def sift_pairs(left: Image, right: Image) -> FloatArray:
         sift.detectAndCompute(image, None) for image in (left, right)
     )
     if first is None or second is None or min(len(points0), len(points1)) < _PICTURES.min_matches:
-        return np.zeros((0, 4))
+        return []
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    near = [
-        m
+    return [
+        (points0[m[0].queryIdx], points1[m[0].trainIdx])
         for m in matcher.knnMatch(first, second, k=2)
         if len(m) == 2 and m[0].distance < _PICTURES.ratio * m[1].distance
     ]
+
+
+def sift_pairs(left: Image, right: Image) -> FloatArray:
+    """Match SIFT points of two images: `[ul vl ur vr]` (N, 4) that fit one fundamental matrix."""
+    import cv2
+
+    near = sift_points(left, right)
     if len(near) < _PICTURES.min_matches:
         return np.zeros((0, 4))
-    z = np.array(
-        [[*points0[m[0].queryIdx].pt, *points1[m[0].trainIdx].pt] for m in near], dtype=np.float64
-    )
+    z = np.array([[*a.pt, *b.pt] for a, b in near], dtype=np.float64)
     cv2.setRNGSeed(0)
     _, mask = cv2.findFundamentalMat(z[:, :2], z[:, 2:], cv2.FM_RANSAC, _PICTURES.ransac_px, 0.999)
     return z if mask is None else z[mask.ravel() > 0]

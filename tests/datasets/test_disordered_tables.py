@@ -1,0 +1,196 @@
+"""Tables whose lines repeat, were written late, or were stamped with lost digits."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.plain_maker import make_plain
+from vio.datasets import open_dataset
+from vio.datasets.tables import read_imu_table, read_velocity_table
+from vio.errors import DataError
+from vio.files.stamps import parse_stamps
+
+HEADER = "timestamp [ns],wx,wy,wz,ax,ay,az"
+START_NS = 1700000000_000000000
+STEP_NS = 5_000_000
+
+
+def _lines(count: int = 400) -> list[str]:
+    rng = np.random.default_rng(count)
+    readings = rng.normal([0, 0, 0, 0, 0, 9.81], 0.1, (count, 6))
+    return [
+        f"{START_NS + STEP_NS * k}," + ",".join(f"{value:.6f}" for value in row)
+        for k, row in enumerate(readings)
+    ]
+
+
+def _read(folder: Path, lines: list[str]) -> tuple[list[int], np.ndarray, tuple[str, ...]]:
+    file = folder / "imu.csv"
+    file.write_text("\n".join([HEADER, *lines]) + "\n")
+    record, notes = read_imu_table(file)
+    return record.times_ns.tolist(), np.hstack([record.gyro, record.accel]), notes
+
+
+def _twice(lines: list[str]) -> list[str]:
+    return [line for line in lines for _ in range(2)]
+
+
+def _late(lines: list[str]) -> list[str]:
+    out = lines.copy()
+    for k in range(20, len(out) - 3, 100):
+        out[k : k + 3] = [out[k + 1], out[k + 2], out[k]]
+    return out
+
+
+def _appended(lines: list[str]) -> list[str]:
+    return [*lines[:200], HEADER, *lines[200:]]
+
+
+@pytest.mark.parametrize(
+    ("change", "note"),
+    [
+        (_twice, "400 lines repeat the one above and are left out"),
+        (_late, "4 lines were written late and are sorted"),
+        (_appended, ""),
+    ],
+)
+def test_lines_that_repeat_or_came_late_leave_the_record_as_it_is(
+    change: Callable[[list[str]], list[str]], note: str, tmp_path: Path
+) -> None:
+    times_ns, values, before = _read(tmp_path, _lines())
+    found_ns, found, notes = _read(tmp_path, change(_lines()))
+    assert found_ns == times_ns
+    np.testing.assert_array_equal(found, values)
+    assert [n.partition(": ")[2] for n in notes if n not in before] == ([note] if note else [])
+
+
+def test_velocities_that_repeat_are_left_out(tmp_path: Path) -> None:
+    file = tmp_path / "velocity.csv"
+    rows = [f"{k / 10},{k},0,0,0,0,0" for k in range(5) for _ in range(2)]
+    file.write_text("time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps\n" + "\n".join(rows))
+    notes = list[str]()
+    assert len(read_velocity_table(file, notes)) == 5
+    assert "5 lines repeat" in notes[0]
+
+
+@pytest.mark.parametrize("back_ns", [2 * STEP_NS + 1_000_000, 2 * STEP_NS, 50 * STEP_NS // 2])
+def test_a_clock_that_was_set_back_is_not_sorted(back_ns: int, tmp_path: Path) -> None:
+    """Its two periods would interleave."""
+    lines = _lines()
+    moved = [f"{int(line[:19]) - back_ns}{line[19:]}" for line in lines[300:]]
+    with pytest.raises(DataError, match="runs backwards"):
+        _read(tmp_path, [*lines[:300], *moved])
+
+
+def test_readings_of_one_stamp_that_differ_are_refused(tmp_path: Path) -> None:
+    lines = _lines()
+    lines[7] = lines[6][:19] + lines[7][19:]
+    with pytest.raises(DataError, match=r"line 9: the clock repeats .* reorder that entry"):
+        _read(tmp_path, lines)
+
+
+@pytest.mark.parametrize("form", ["{:.5E}", "{:.7E}"])
+def test_stamps_with_too_few_digits_are_said_to_be(form: str, tmp_path: Path) -> None:
+    """As spreadsheets save them."""
+    lines = [f"{form.format(int(line[:19]))}{line[19:]}" for line in _lines()]
+    with pytest.raises(DataError, match="written with too few digits; write all their digits"):
+        _read(tmp_path, lines)
+
+
+@pytest.mark.parametrize("where", ["imu.csv", "times.txt"])
+def test_nanoseconds_without_their_zeros_are_said_to_be(where: str, tmp_path: Path) -> None:
+    """1700000000.50000000 for 50 ms after the second: as a decimal it is half a second."""
+    folder = make_plain(tmp_path, frames=30)
+    file = folder / where
+    lost = lambda found: f"{found[1]}.{int(found[2])}"  # noqa: E731
+    text = re.sub(r"\[ns\]", "[s]", file.read_text())
+    file.write_text(re.sub(r"^(\d{10})\.?(\d{9})", lost, text, flags=re.MULTILINE))
+    with pytest.raises(DataError, match=r"lack their leading zeros; write 1\d{9}\.0\d{8} for"):
+        open_dataset(folder)
+
+
+def test_decimals_of_any_length_are_no_nanoseconds() -> None:
+    texts = ["3.9", "4", "4.05", "4.1", "4.15", "4.2"]
+    assert parse_stamps(texts, str).tolist() == [round(float(t) * 1e9) for t in texts]
+
+
+def test_names_whose_nanoseconds_lack_their_zeros_are_said_to(tmp_path: Path) -> None:
+    """Without an IMU they were numbers of frames 0.1 s apart."""
+    name = lambda side, k: f"1700000000.{50_000_000 * k + 12_000_000}.png"  # noqa: E731
+    folder = make_plain(tmp_path, name=name, times=False, imu=False)
+    with pytest.raises(DataError, match=r"lack their leading zeros.*write 1700000000\.012000000"):
+        open_dataset(folder)
+
+
+def test_names_whose_last_zeros_were_cut_are_times(tmp_path: Path) -> None:
+    ns = [1700000000_000000000 + 37_512_000 * k for k in range(6)]
+    name = lambda side, k: f"{ns[k] // 10**9}.{ns[k] % 10**9:09d}".rstrip("0") + ".png"  # noqa: E731
+    folder = make_plain(tmp_path, 6, name=lambda s, k: name(s, k).replace("..", "."), times=False)
+    assert open_dataset(folder).recording.frame_times_ns.tolist() == ns
+
+
+def _named(folder: Path, name: Callable[[int], str]) -> list[int]:
+    made = make_plain(folder, name=lambda _, k: f"{name(k)}.png", times=False)
+    return open_dataset(made).recording.frame_times_ns.tolist()
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "2024-05-12_14-{0}-{1}-{2:03d}000",
+        "2024-05-12T14:{0}:{1}.{2:03d}000000Z",
+        "20240512_14{0}{1}_{2:03d}",
+        "left_2024051214{0}{1}{2:03d}",
+        "2024051214{0}{1}{2:03d}000",
+    ],
+)
+def test_names_may_be_dates(form: str, tmp_path: Path) -> None:
+    """They were counted at 10 Hz, or read as milliseconds with a leap at each minute."""
+    seconds = [59.96, 60.01, 60.06, 60.11]
+    name = lambda k: form.format(  # noqa: E731
+        f"{3 + int(seconds[k]) // 60:02d}",
+        f"{int(seconds[k]) % 60:02d}",
+        round(1000 * (seconds[k] % 1)),
+    )
+    made = make_plain(
+        tmp_path, name=lambda _, k: f"{name(k)}.png", times=False, imu=False, reference=False
+    )
+    times_ns = open_dataset(made).recording.frame_times_ns
+    assert np.diff(times_ns).tolist() == [50_000_000] * 3
+    assert times_ns[1] == np.datetime64("2024-05-12T14:04:00.010", "ns").astype(np.int64)
+
+
+def test_a_stamp_behind_the_number_of_the_frame_is_its_time(tmp_path: Path) -> None:
+    ns = [1700000000_000000000 + 50_000_000 * k for k in range(4)]
+    assert _named(tmp_path, lambda k: f"{k:06d}_{ns[k]}") == ns
+
+
+def test_a_date_and_a_number_are_no_stamp(tmp_path: Path) -> None:
+    made = make_plain(
+        tmp_path, name=lambda _, k: f"240512_{10_000_000_000 + k}.png", times=False, imu=False
+    )
+    assert np.diff(open_dataset(made).recording.frame_times_ns).tolist() == [100_000_000] * 3
+
+
+def test_lists_of_times_may_be_dates_of_iso_8601(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, imu=False)
+    lines = [f"2023-11-14T22:13:20.{50 * k:03d}Z" for k in range(4)]
+    (folder / "times.txt").write_text("\n".join(lines) + "\n")
+    times_ns = open_dataset(folder).recording.frame_times_ns
+    assert times_ns.tolist() == [1700000000_000000000 + 50_000_000 * k for k in range(4)]
+
+
+@pytest.mark.parametrize(("first", "doubted"), [(97, True), (90, False)])
+def test_a_counter_that_began_again_is_doubted(first: int, doubted: bool, tmp_path: Path) -> None:
+    """Images 97, 98, 99, 00, 01 … in the order of their numbers begin with 00."""
+    folder = make_plain(
+        tmp_path, 6, name=lambda _, k: f"img{(first + k) % 100:02d}.png", times=False, imu=False
+    )
+    doubts = [note for note in open_dataset(folder).recording.notes if "doubtful" in note]
+    assert len(doubts) == doubted
+    assert all("img97.png is the first image" in doubt for doubt in doubts)

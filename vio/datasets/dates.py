@@ -1,0 +1,55 @@
+"""Dates as people name images by and write into lists, as UTC in nanoseconds since 1970."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from vio.records import IntArray
+
+_DAY = r"(?P<y>19\d\d|20\d\d){0}(?P<mo>0[1-9]|1[0-2]){0}(?P<d>0[1-9]|[12]\d|3[01])"
+_CLOCK = r"(?P<h>[01]\d|2[0-3]){0}(?P<mi>[0-5]\d){0}(?P<s>[0-5]\d)"
+# `2024-05-12_14-03-22-123456`, `20240512T140322.123`, `20240512140322123`
+_PART = r"[-_.:]?"
+_NAMED = re.compile(
+    r"(?:[A-Za-z]+\d?[_-])?"
+    + _DAY.format(r"[-_.]?")
+    + r"[-_ T.]?"
+    + _CLOCK.format(_PART)
+    + r"(?:[-_.,]?(?P<part>\d{9}|\d{6}|\d{3}))?Z?(?:[_-][A-Za-z]+\d?)?"
+)
+# whose nanoseconds fit 64 bits; of other zones than UTC none
+_WRITTEN = re.compile(
+    r"(?P<day>(?:19|20|21)\d\d-\d\d-\d\d)[ T](?P<clock>\d\d:\d\d:\d\d(?:\.\d{0,9})?)(?:Z|\+00:?00)?"
+)
+
+
+def date_ns(text: str) -> int:
+    """Parse '2011-09-26 14:02:25.951199337', or with T and Z as of ISO 8601.
+
+    Raises:
+        ValueError: it is another form, or no date.
+    """
+    found = _WRITTEN.fullmatch(text.strip())
+    if found is None:
+        raise ValueError(text)
+    written = f"{found['day']}T{found['clock'].rstrip('.')}"
+    return int(np.datetime64(written, "ns").astype(np.int64))
+
+
+def dates_in_names(stems: Sequence[str]) -> IntArray | None:
+    """Return the dates (N,) that names state to a fraction of a second; None: they state others."""
+    times = list[int]()
+    for stem in stems:
+        found = _NAMED.fullmatch(stem)
+        if found is None or found["part"] is None:
+            return None
+        day = f"{found['y']}-{found['mo']}-{found['d']}"
+        clock = f"{found['h']}:{found['mi']}:{found['s']}.{found['part']}"
+        try:
+            times.append(int(np.datetime64(f"{day}T{clock}", "ns").astype(np.int64)))
+        except ValueError:  # as of the 31st of June
+            return None
+    return np.array(times, dtype=np.int64)
