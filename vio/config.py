@@ -282,16 +282,24 @@ def _checked(value: Any, hint: Any, path: str, where: str) -> Any:
         return _checked(value, members[0], path, where)
     if origin is Literal:
         return _chosen(value, get_args(hint), path, where)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+    converted = _converted(value, hint)
+    if not isinstance(converted, hint):
+        got = f"{_short(repr(value))}{_number_hint(value, hint)}"
+        raise ConfigError(f"{where}: {path} takes {_TYPES.get(hint, hint)}, got {got}")
+    if hint is float and math.isnan(converted):
+        raise ConfigError(f"{where}: {path} must be a number, got nan")
+    return converted
+
+
+def _converted(value: Any, hint: Any) -> Any:
+    """Return a value of YAML in a setting's type where it stands for one; None: it does not."""
+    if isinstance(value, bool):  # which Python takes for a whole number
+        return value if hint is bool else None
+    if hint is float and isinstance(value, int):
         return float(value) if abs(value) < 2**1000 else math.inf  # which no range allows
     if hint is Path and isinstance(value, str):
         return Path(value)
-    if isinstance(value, hint) and not (isinstance(value, bool) and hint is not bool):
-        if hint is float and value != value:
-            raise ConfigError(f"{where}: {path} must be a number, got nan")
-        return value
-    got = f"{_short(repr(value))}{_number_hint(value, hint)}"
-    raise ConfigError(f"{where}: {path} takes {_TYPES.get(hint, hint)}, got {got}")
+    return value
 
 
 def _chosen(value: Any, choices: tuple[Any, ...], path: str, where: str) -> Any:
@@ -321,29 +329,32 @@ def _number_hint(value: Any, hint: Any) -> str:
 
 
 def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
-    """Suggest a setting: the same name in a sibling section, a similar one here, or the same name
-    anywhere.
-
-    A name may be split over section and setting: `consensus_samples` is `consensus.samples`.
-    """
+    """Suggest what to write for an unknown setting."""
     if prefix + key in _RENAMED:
         return f"; it is '{_RENAMED[prefix + key]}' since 0.3"
     if key in _FIXED.get(prefix[:-1], "").split():
         return "; it is fixed since 0.3: remove it"
+    near = _nearest_setting(key, names, prefix, root)
+    if near is not None:
+        return f"; did you mean '{near}'?"
+    named = ", ".join(prefix + name for name in names[:_MAX_NAMED])
+    more = len(names) - _MAX_NAMED
+    return f"; valid here: {named}" + (
+        f" and {more} more, see vio config --all" if more > 0 else ""
+    )
+
+
+def _nearest_setting(key: str, names: Sequence[str], prefix: str, root: Any) -> str | None:
+    """Return the same name in a sibling section, a similar one here, or the same name anywhere.
+
+    A name may be split over section and setting: `consensus_samples` is `consensus.samples`.
+    """
     same_name = [
         row.key for row in describe(root) if f".{row.key}".replace(".", "_").endswith(f"_{key}")
     ]
     siblings = [name for name in same_name if name.startswith(prefix[: prefix.find(".") + 1])]
     similar = [prefix + name for name in difflib.get_close_matches(key, names, 1, cutoff=0.4)]
-    for found in (siblings, similar, same_name):
-        if found:
-            return f"; did you mean '{found[0]}'?"
-    more = (
-        f" and {len(names) - _MAX_NAMED} more, see vio config --all"
-        if len(names) > _MAX_NAMED
-        else ""
-    )
-    return f"; valid here: {', '.join(prefix + name for name in names[:_MAX_NAMED])}{more}"
+    return next(iter(siblings + similar + same_name), None)
 
 
 def _plain(value: Any) -> Any:

@@ -25,8 +25,7 @@ def _dataclass(*, slots: bool = False, frozen: bool = False) -> Callable[[type[A
     """Return the decorator of a class with slots."""
 
     def decorate(cls: type[Any]) -> type[Any]:
-        inherits = any(hasattr(base, "__dataclass_fields__") for base in cls.__bases__)
-        if inherits or not slots or not cls.__doc__ or any(name in vars(cls) for name in _SHARED):
+        if not slots or _needs_standard(cls):
             return dataclasses.dataclass(frozen=frozen, slots=slots)(cls)
         made: Any = dataclasses.dataclass(init=False, repr=False, eq=False, slots=True)(cls)
         own = fields(made)
@@ -40,15 +39,27 @@ def _dataclass(*, slots: bool = False, frozen: bool = False) -> Callable[[type[A
         made.__eq__ = _equals([f.name for f in own if f.compare])
         made.__hash__ = None
         if frozen:
-            hashed = [f.name for f in own if (f.compare if f.hash is None else f.hash)]
-            made.__hash__ = _hash_of(hashed)
-            made.__setattr__ = _refusing_to_set(made)
-            made.__delattr__ = _refusing_to_delete(made)
-            made.__getstate__ = dataclasses._dataclass_getstate  # type: ignore[attr-defined]
-            made.__setstate__ = dataclasses._dataclass_setstate  # type: ignore[attr-defined]
+            _freeze(made)
         return made
 
     return decorate
+
+
+def _needs_standard(cls: type[Any]) -> bool:
+    """Tell whether a class inherits from a dataclass or writes something itself that is shared."""
+    if any(hasattr(base, "__dataclass_fields__") for base in cls.__bases__):
+        return True
+    return not cls.__doc__ or any(name in vars(cls) for name in _SHARED)
+
+
+def _freeze(made: Any) -> None:
+    """Give a class the methods of one whose instances cannot change."""
+    hashed = [f.name for f in fields(made) if (f.compare if f.hash is None else f.hash)]
+    made.__hash__ = _hash_of(hashed)
+    made.__setattr__ = _refusing_to_set(made)
+    made.__delattr__ = _refusing_to_delete(made)
+    made.__getstate__ = dataclasses._dataclass_getstate  # type: ignore[attr-defined]
+    made.__setstate__ = dataclasses._dataclass_setstate  # type: ignore[attr-defined]
 
 
 class _LateInit:

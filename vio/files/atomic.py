@@ -83,16 +83,21 @@ def _remove_leftovers(target: Path) -> None:
             logger.warning(
                 "%s is the earlier content of %s, kept when a process was killed", path, target
             )
-            continue
-        descriptor = None if path.is_symlink() else lock_path(path)
-        if descriptor is None:
-            continue
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
         else:
-            with contextlib.suppress(OSError):
-                path.unlink()
-        os.close(descriptor)
+            _remove_unlocked(path)
+
+
+def _remove_unlocked(path: Path) -> None:
+    """Remove a file or folder that no living process has locked."""
+    descriptor = None if path.is_symlink() else lock_path(path)
+    if descriptor is None:
+        return
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink()
+    os.close(descriptor)
 
 
 @contextlib.contextmanager
@@ -279,24 +284,33 @@ def check_replaceable(
         )
     if target.is_symlink() or not target.is_dir():
         raise VioError(f"{target} is not a folder and will not be replaced; choose another path")
-    if any(target.iterdir()) and (marker is None or not (target / marker).is_file()):
-        wanted = "" if marker is None else f" (it has no {marker})"
-        raise VioError(
-            f"{target} was not made by this program{wanted} and will not be replaced; choose "
-            "another path"
-        )
-    foreign = (
-        []
-        if own is None
-        else sorted(path.name for path in target.iterdir() if path.name not in own)
+    held = sorted(path.name for path in target.iterdir())
+    if held:
+        _check_made_here(target, marker)
+    if own is not None:
+        _check_nothing_foreign(target, [name for name in held if name not in own])
+
+
+def _check_made_here(target: Path, marker: str | None) -> None:
+    """Raise VioError where a folder lacks the file by which an earlier result is recognised."""
+    if marker is not None and (target / marker).is_file():
+        return
+    wanted = "" if marker is None else f" (it has no {marker})"
+    raise VioError(
+        f"{target} was not made by this program{wanted} and will not be replaced; choose "
+        "another path"
     )
-    if foreign:
-        names = ", ".join(foreign[:3]) + (" and more" if len(foreign) > 3 else "")
-        raise VioError(
-            f"{target} holds {names} beside an earlier result and will not be replaced; move that "
-            "away, or choose "
-            "another path"
-        )
+
+
+def _check_nothing_foreign(target: Path, foreign: list[str]) -> None:
+    """Raise VioError where a folder holds files that are no part of an earlier result."""
+    if not foreign:
+        return
+    names = ", ".join(foreign[:3]) + (" and more" if len(foreign) > 3 else "")
+    raise VioError(
+        f"{target} holds {names} beside an earlier result and will not be replaced; move that "
+        "away, or choose another path"
+    )
 
 
 def check_spares(source: Path, target: Path) -> None:

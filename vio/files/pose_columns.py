@@ -53,24 +53,38 @@ def pose_columns(headers: Sequence[str], count: int, *, w_first: bool) -> PoseCo
         found = _named_columns(cells)
         if found is not None:
             return found
-    unit = next((u for cells in reversed(named) if (u := time_unit(cells[0])) is not None), None)
-    if unit is None:
-        first = [split_cells(text)[0] for text in headers if text.strip()]
-        unit = next((u for cell in reversed(first) if (u := time_unit(cell)) is not None), None)
-    if unit is None:
-        unit = time_unit_in_words(headers)
+    unit = _stated_unit(headers, named)
     if count < 8:
         return PoseColumns(0, (1, 2, 3), None, "none", unit)
-    order = next((o for text in reversed(headers) if (o := _order_in(text)) is not None), None)
-    first_is_w = w_first if order is None else order == "wxyz"
-    assumed: Orientations = "w first, assumed" if w_first else "w last, assumed"
-    return PoseColumns(
-        0,
-        (1, 2, 3),
-        (5, 6, 7, 4) if first_is_w else (4, 5, 6, 7),
-        assumed if order is None else "stated",
-        unit,
-    )
+    w_stands_first, orientations = _assumed_order(headers, w_first=w_first)
+    quaternion = (5, 6, 7, 4) if w_stands_first else (4, 5, 6, 7)
+    return PoseColumns(0, (1, 2, 3), quaternion, orientations, unit)
+
+
+def _assumed_order(headers: Sequence[str], *, w_first: bool) -> tuple[bool, Orientations]:
+    """Return whether w is the first component of the quaternions, and whether a header says it."""
+    for text in reversed(headers):
+        order = _order_in(text)
+        if order is not None:
+            return order == "wxyz", "stated"
+    return w_first, "w first, assumed" if w_first else "w last, assumed"
+
+
+def _stated_unit(headers: Sequence[str], named: Sequence[Sequence[str]]) -> str | None:
+    """Return the unit of the stamps that the last header to do so states, by the name of its first
+    cell, else in words; None: none states it.
+
+    Args:
+        headers: comments and lines of names.
+        named: the cells of those that name every column.
+    """
+    names = [cells[0] for cells in reversed(named)]
+    names += [cells[0] for text in reversed(headers) if (cells := split_cells(text))]
+    for name in names:
+        unit = time_unit(name)
+        if unit is not None:
+            return unit
+    return time_unit_in_words(headers)
 
 
 def _named_columns(cells: Sequence[str]) -> PoseColumns | None:
@@ -83,15 +97,20 @@ def _named_columns(cells: Sequence[str]) -> PoseColumns | None:
     position = _components([n if not _OTHER.match(n) else "" for n in others], _POSITION, "xyz")
     if position is None:
         return None
-    times = [k for k, name in enumerate(names) if _is_time(name)]
-    # that of a message goes before that of its recording
-    stamp = next((k for k in times if "headerstamp" in names[k]), times[0] if times else 0)
-    after = stamp + 1
-    has_ns = names[stamp] in ("sec", "secs", "seconds") and "nsec" in names[after : after + 1]
-    unit = "s" if has_ns else time_unit(cells[stamp])
     a, b, c = position
     x, y, z, w = quaternion
-    return PoseColumns(stamp, (a, b, c), (x, y, z, w), "stated", unit, after if has_ns else None)
+    stamp = _stamp_column(names)
+    after = stamp + 1
+    if names[stamp] in ("sec", "secs", "seconds") and "nsec" in names[after : after + 1]:
+        return PoseColumns(stamp, (a, b, c), (x, y, z, w), "stated", "s", after)
+    return PoseColumns(stamp, (a, b, c), (x, y, z, w), "stated", time_unit(cells[stamp]))
+
+
+def _stamp_column(names: Sequence[str]) -> int:
+    """Return the column of the times; that of a message goes before that of its recording."""
+    times = [k for k, name in enumerate(names) if _is_time(name)]
+    of_messages = [k for k in times if "headerstamp" in names[k]]
+    return next(iter(of_messages + times), 0)
 
 
 def _is_time(name: str) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import field
 from typing import Any
 
@@ -31,22 +31,28 @@ class Shape:
         if type(value) not in self.kinds or not _is_usable(value):
             null = " or null" if self.or_null else ""
             return f"{name or 'the file'} must be {self.words}{null}, got {_shown(value)}"
-        inner = f"{name}." if name else ""
+        return next(self._faults_inside(value, f"{name}." if name else ""), None)
+
+    def _faults_inside(self, value: Any, inner: str) -> Iterator[str]:
+        """Yield what is wrong with the members of a value, whose names begin with `inner`."""
         if isinstance(value, dict):
             for key in sorted(self.needed - value.keys()):
-                return f"{inner}{key} is missing"
-        for key, part in _parts(value):
-            shape = self.members.get(str(key), self.each) if isinstance(value, dict) else self.each
-            found = None if shape is None else shape.fault(part, f"{inner}{key}")
-            if found is not None:
-                return found
-        return None
+                yield f"{inner}{key} is missing"
+        for key, part, shape in self._shaped_parts(value):
+            fault = shape.fault(part, f"{inner}{key}")
+            if fault is not None:
+                yield fault
 
-
-def _parts(value: Any) -> list[tuple[Any, Any]]:
-    if isinstance(value, dict):
-        return list(value.items())
-    return list(enumerate(value)) if isinstance(value, list) else []
+    def _shaped_parts(self, value: Any) -> Iterator[tuple[Any, Any, Shape]]:
+        """Yield key, value and shape of the members whose shape is known."""
+        if isinstance(value, dict):
+            for key, part in value.items():
+                shape = self.members.get(str(key), self.each)
+                if shape is not None:
+                    yield key, part, shape
+        elif isinstance(value, list) and self.each is not None:
+            for k, part in enumerate(value):
+                yield k, part, self.each
 
 
 def _is_usable(value: Any) -> bool:

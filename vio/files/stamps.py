@@ -46,6 +46,10 @@ class Pace:
     # Other units are tried so that the median interval is between this and a thousand times it.
     usual_s: float
 
+    def believes(self, apart_s: float) -> bool:
+        """Tell whether entries of the kind may be this far apart."""
+        return self.least_s <= apart_s <= self.most_s
+
 
 FRAME_PACE = Pace("frames", 1e-3, 5.0, 2e-3)
 SAMPLE_PACE = Pace("samples", 1e-5, 0.5, 5e-5)
@@ -155,31 +159,35 @@ def _unit_of(
     if pace is None or len(values) < 2 or any(value.copy_abs() > INT64_MAX for value in values):
         return by_size
     mean = float(values[-1] - values[0]) / (len(values) - 1)
-    if pace.least_s <= mean * _seconds(by_size) <= pace.most_s:
+    if pace.believes(mean * _seconds(by_size)):
         return by_size
-    steps = [float(b - a) for a, b in pairwise(values)]
-    step = float(np.median(steps))
-    if pace.least_s <= step * _seconds(by_size) <= pace.most_s:
+    step = float(np.median([float(b - a) for a, b in pairwise(values)]))
+    if pace.believes(step * _seconds(by_size)):
         return by_size
-    by_pace: TimeUnit | None = next(
-        (
-            unit
-            for unit in ("s", "ms", "us", "ns")
-            if pace.usual_s <= step * _seconds(unit) < _DECADES * pace.usual_s
-            and values[-1].copy_abs() <= Decimal(INT64_MAX).scaleb(-_POWERS[unit])
-        ),
-        None,
-    )
+    by_pace = _unit_by_pace(step, values[-1], pace)
     if by_pace is None:
         return by_size
     if doubts is not None:
-        apart, other = (f"{step * _seconds(unit):.4g} s" for unit in (by_pace, by_size))
+        apart = step * _seconds(by_pace)
+        other = step * _seconds(by_size)
         doubts.append(
-            f"{where(0)}: its times are taken for {_NAMES[by_pace]} ({pace.what} {apart} apart), "
-            f"as they would be {other} apart in {_NAMES[by_size]}; if that is wrong, state the "
-            "unit in a header, as '# time [s]'"
+            f"{where(0)}: its times are taken for {_NAMES[by_pace]} ({pace.what} {apart:.4g} s "
+            f"apart), as they would be {other:.4g} s apart in {_NAMES[by_size]}; if that is wrong, "
+            "state the unit in a header, as '# time [s]'"
         )
     return by_pace
+
+
+def _unit_by_pace(step: float, last: Decimal, pace: Pace) -> TimeUnit | None:
+    """Return the unit in which a median step is usual and the last stamp fits; None: there is
+    none.
+    """
+    units: tuple[TimeUnit, ...] = ("s", "ms", "us", "ns")
+    for unit in units:
+        usual = pace.usual_s <= step * _seconds(unit) < _DECADES * pace.usual_s
+        if usual and last.copy_abs() <= Decimal(INT64_MAX).scaleb(-_POWERS[unit]):
+            return unit
+    return None
 
 
 def _seconds(unit: str) -> float:

@@ -124,8 +124,9 @@ def read_trajectory(
     columns = pose_columns(table.comments, len(table.fields(0)), w_first=kind == "euroc")
     times_ns = _times_ns(table, columns, kind)
     poses, orientations = _quaternion_poses(table, columns, kind)
-    header_body = _header(table, r"body:\s*(\S+)") if kind == "tum" else None
-    frames = _header(table, r"frames:\s*(.*\S)") if kind == "tum" else None
+    comments = table.comments if kind == "tum" else []
+    header_body = _header(comments, r"body:\s*(\S+)")
+    frames = _header(comments, r"frames:\s*(.*\S)")
     numbers = None if frames is None else _parse_frames(table, frames)
     trajectory = Trajectory(
         poses, times_ns, _body(table, header_body, body) or _DEFAULT_BODY[kind], numbers
@@ -157,14 +158,20 @@ def _with_orientations(
     return replace(trajectory, orientations=orientations)
 
 
+def _stamp_texts(table: _Table, columns: PoseColumns) -> list[str]:
+    """Return the stamps as text, with the nanoseconds that stand in a column of their own."""
+    stamps = table.column(columns.stamp)
+    if columns.nanoseconds is None:
+        return stamps
+    parts = table.column(columns.nanoseconds)
+    return [f"{s}.{ns.zfill(9)}" for s, ns in zip(stamps, parts, strict=True)]
+
+
 def _times_ns(table: _Table, columns: PoseColumns, kind: TrajectoryFormat) -> IntArray:
     """Return the stamps (N,): in the unit that is stated, else in nanoseconds where a table of
     EuRoC's form has whole numbers, else by their size and by how far apart poses are.
     """
-    stamps = table.column(columns.stamp)
-    if columns.nanoseconds is not None:
-        parts = table.column(columns.nanoseconds)
-        stamps = [f"{s}.{ns.zfill(9)}" for s, ns in zip(stamps, parts, strict=True)]
+    stamps = _stamp_texts(table, columns)
     unit = columns.unit
     if unit is None and kind == "euroc" and _are_nanoseconds(stamps):
         unit = "ns"
@@ -459,9 +466,9 @@ def _kitti_poses(table: _Table) -> FloatArray:
     return se3_from_parts(orthonormal, values[:, :, 3])
 
 
-def _header(table: _Table, pattern: str) -> str | None:
+def _header(comments: Sequence[str], pattern: str) -> str | None:
     """Return the value of the first comment that matches the pattern."""
-    found = (re.fullmatch(pattern, comment) for comment in table.comments)
+    found = (re.fullmatch(pattern, comment) for comment in comments)
     return next((match.group(1) for match in found if match), None)
 
 
@@ -505,14 +512,8 @@ def _format_frames(frames: IntArray) -> str:
 
 
 def _parse_frames(table: _Table, text: str) -> IntArray:
-    runs = [re.fullmatch(r"(\d{1,9})-(\d{1,9})(?:/([1-9]\d{0,8}))?", run) for run in text.split()]
-    spans = [
-        range(int(run.group(1)), int(run.group(2)) + 1, int(run.group(3) or 1))
-        for run in runs
-        if run
-    ]
-    ordered = all(len(a) and len(b) and a[-1] < b[0] for a, b in pairwise(spans))
-    if not all(runs) or not ordered or sum(map(len, spans)) != len(table.rows):
+    spans = _frame_spans(text)
+    if spans is None or sum(map(len, spans)) != len(table.rows):
         raise DataError(
             f"{table.path}: its comment '# frames: {text[:60]}' does not number its "
             f"{len(table.rows)} poses; "
@@ -521,3 +522,18 @@ def _parse_frames(table: _Table, text: str) -> IntArray:
     return np.concatenate(
         [np.arange(span.start, span.stop, span.step, dtype=np.int64) for span in spans]
     )
+
+
+def _frame_spans(text: str) -> list[range] | None:
+    """Return the ranges that a text such as `0-41 45-99/2` names; None: they do not increase, or it
+    is no such text.
+    """
+    spans = []
+    for run in text.split():
+        match = re.fullmatch(r"(\d{1,9})-(\d{1,9})(?:/([1-9]\d{0,8}))?", run)
+        if match is None:
+            return None
+        first, last, step = match.groups(default="1")
+        spans.append(range(int(first), int(last) + 1, int(step)))
+    ordered = all(len(a) and len(b) and a[-1] < b[0] for a, b in pairwise(spans))
+    return spans if ordered else None

@@ -64,16 +64,27 @@ def split_cells(text: str) -> list[str]:
     Commas within numbers between semicolons or tabs are decimal points; quotes around cells are
     left out.
     """
-    if '"' in text:
-        text = text.replace('"', "")
-    if "," in text and (";" in text or "\t" in text):
-        cells = [cell.strip() for cell in text.split(";" if ";" in text else "\t")]
-        if all(_DECIMAL_COMMA.fullmatch(cell) for cell in cells):
-            return [cell.replace(",", ".") for cell in cells]
-    for separator in (",", ";"):
-        if separator in text:
-            return [cell.strip() for cell in text.split(separator)]
-    return text.split()
+    text = text.replace('"', "")
+    if "," in text:
+        return _cells_with_decimal_commas(text) or _cells_between(text, ",")
+    return _cells_between(text, ";") if ";" in text else text.split()
+
+
+def _cells_between(text: str, separator: str) -> list[str]:
+    return [cell.strip() for cell in text.split(separator)]
+
+
+def _cells_with_decimal_commas(text: str) -> list[str]:
+    """Return the cells between semicolons, else tabs, where all are numbers with a decimal comma,
+    with points; else none.
+    """
+    separator = next((s for s in (";", "\t") if s in text), None)
+    if separator is None:
+        return []
+    cells = _cells_between(text, separator)
+    if not all(_DECIMAL_COMMA.fullmatch(cell) for cell in cells):
+        return []
+    return [cell.replace(",", ".") for cell in cells]
 
 
 def header_cells(text: str, columns: int) -> list[str]:
