@@ -28,12 +28,11 @@ _RECENT = 20  # frames, of which so many are off where a pair shakes
 _SHAKING = 5
 _CODE = "right-camera-turned"
 _SHAKE_CODE = "right-camera-shakes"
-_MIN_FRAMES = 8  # whose common errors are known, before a pair is said to shake
+_MIN_FRAMES = 10  # whose common errors are known, before a pair is said to shake
 _SHAKES_PX = 0.12  # standard deviation of the common error …
 # … and of the angle: a drive whose calibration is off comes to 0.15 px, 0.012 degrees
 _SHAKES_RAD = 0.02 * np.pi / 180.0
-_SHARE = 0.8  # of the common errors, whose largest measures their size: events are in fewer frames
-_SHARE_SIGMAS = 1.2816  # of a normal distribution
+_MEDIAN_SIGMAS = 0.6745  # median size of a normal distribution, standard deviations
 _PIXEL_SIGMA = 0.3  # of one disparity, pixels
 
 
@@ -162,11 +161,10 @@ class PairShake(Finder):
             self._found.append(Finding(_SHAKE_CODE, message, index, ended=True))
 
     def _measured_px(self) -> float:
-        """Size of the common errors. A frame's is the difference of two: its depths are those of
-        the frame before.
+        """Size of the common errors, by their median: other events, as a car that passes, may be
+        in almost half of the frames. A frame's error is the difference of two: its depths are those
+        of the frame before.
         """
         if len(self._common_px) < _MIN_FRAMES:
             return 0.0
-        sizes = np.sort(np.abs(self._common_px))
-        largest = float(sizes[round(_SHARE * (len(sizes) - 1))])
-        return largest / (_SHARE_SIGMAS * float(np.sqrt(2.0)))
+        return float(np.median(np.abs(self._common_px))) / (_MEDIAN_SIGMAS * float(np.sqrt(2.0)))
