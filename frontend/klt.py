@@ -77,6 +77,7 @@ class KltFrontend:
 
     # by the motion of the left image, as it matches
     checks_matches = True
+    checks_objects = True
 
     def __init__(
         self,
