@@ -27,8 +27,9 @@ from vio.frontend.frames import FrameValidator, Stopwatch, make_output
 from vio.frontend.outliers import MotionPriors, RansacProblem, predicted_motion, static_tracks
 from vio.frontend.patches import inside
 from vio.frontend.prediction import moved_pixels, prior_pixels, usable_prior
+from vio.frontend.scene_motion import MovedPoints, SceneMotion
 from vio.frontend.settings import FrontendSettings, MatchSettings
-from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX
+from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, EpipolarRowModel
 from vio.frontend.tracks import ANCHOR_RADIUS_PX
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, triangulate
@@ -248,6 +249,7 @@ class _Tracks:
     left: FloatArray  # (N, 2) pixels
     right: FloatArray  # (N, 2) pixels, arbitrary where has_right is False
     has_right: BoolArray  # (N,)
+    age: IntArray  # (N,) frames since detection
     keypoints: Keypoints  # (N,) of the last frame
 
     def __len__(self) -> int:
@@ -270,6 +272,8 @@ class DescriptorFrontend:
     One instance processes one recording: ids increase and are never reused.
     """
 
+    checks_objects = True
+
     def __init__(
         self,
         camera: StereoCamera,
@@ -287,6 +291,8 @@ class DescriptorFrontend:
         self._validator = FrameValidator(camera, name)
         self._previous: _PreviousFrame | None = None
         self._next_id = 0
+        self._scene = SceneMotion()
+        self._rows: EpipolarRowModel | None = None
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Extract, match and reject in one rectified stereo pair; see `vio.protocols.Frontend`."""
@@ -304,6 +310,8 @@ class DescriptorFrontend:
         watch.lap("extract")
         left = extracted[0]
         pair = self._stereo(left, extracted[1], images) if usable else _unmatched(left)
+        matched = pair.has_right
+        self._row_model(images[0]).update(left.pixels[matched], pair.right[matched])
         watch.lap("stereo")
         tracks, twist, used = self._track(frame, pair, images[0], usable_prior(prior))
         watch.lap("track")
@@ -311,7 +319,7 @@ class DescriptorFrontend:
         tracks = self._add_new_features(tracks, pair, used, images[0])
         self._previous = _PreviousFrame(frame.time_ns, images[0].copy(), tracks, twist)
         watch.lap("check")
-        return make_output(frame, tracks, tracked, watch)
+        return make_output(frame, tracks, tracked, watch, self._scene.take_findings())
 
     # --- left and right
     # -----------------------------------------------------------------------------------------------
@@ -385,6 +393,7 @@ class DescriptorFrontend:
                 np.zeros((0, 2)),
                 np.zeros((0, 2)),
                 np.zeros(0, np.bool_),
+                nothing,
                 take(pair.keypoints, nothing),
             )
             return empty, np.zeros(6) if previous is None else previous.twist_per_s, used
@@ -426,6 +435,11 @@ class DescriptorFrontend:
         agrees = pair.has_right[found]
         twist = previous.twist_per_s
         if motion is not None:
+            points = MovedPoints(p_rows[known], pixels[known], old.age[rows[known]])
+            error_px = self._row_model(view).disparity_error_px(self._camera.fu)
+            chosen = self._scene.choose(frame.index, problem, points, motion, prior, error_px)
+            motion = chosen.motion
+            keep[known] = chosen.static
             keep[~known] = False
             twist = se3_log(motion.T_curr_prev) / seconds
             depth = depth_of(self._camera, transform_points(motion.T_curr_prev, p_rows))
@@ -437,13 +451,22 @@ class DescriptorFrontend:
         rows = rows[keep]
         found = found[keep]
         used[found] = True
-        return (
-            _Tracks(
-                old.ids[rows], pixels[keep], right[keep], agrees[keep], take(pair.keypoints, found)
-            ),
-            twist,
-            used,
+        tracks = _Tracks(
+            old.ids[rows],
+            pixels[keep],
+            right[keep],
+            agrees[keep],
+            old.age[rows] + 1,
+            take(pair.keypoints, found),
         )
+        return tracks, twist, used
+
+    def _row_model(self, view: Image) -> EpipolarRowModel:
+        """The row differences of matches over the image, made with the first image's size."""
+        if self._rows is None:
+            height, width = view.shape
+            self._rows = EpipolarRowModel(width, height)
+        return self._rows
 
     def _guess(
         self, old: _Tracks, p_prev: FloatArray, expected: FloatArray, prior: TrackPrior | None
@@ -483,6 +506,7 @@ class DescriptorFrontend:
             left[chosen],
             pair.right[chosen],
             pair.has_right[chosen],
+            np.zeros(len(chosen), dtype=np.int64),
             take(pair.keypoints, chosen),
         )
         return joined(tracks, new)

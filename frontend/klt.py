@@ -16,13 +16,7 @@ from vio.frontend.columns import changed
 from vio.frontend.detect import detect_corners, half_mask, load_mask
 from vio.frontend.flow import track_with_retries
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
-from vio.frontend.moving_object import (
-    ObjectReport,
-    choose_motion,
-    one_motion_explains,
-    static_by_prediction,
-    voters,
-)
+from vio.frontend.moving_object import static_by_prediction
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import (
@@ -40,6 +34,7 @@ from vio.frontend.right_alone import RightAlone
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.right_delay import RightDelay
 from vio.frontend.right_match import FrameImages, RightMatcher
+from vio.frontend.scene_motion import MovedPoints, SceneMotion
 from vio.frontend.settings import FrontendSettings
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import (
@@ -82,6 +77,7 @@ class KltFrontend:
 
     # by the motion of the left image, as it matches
     checks_matches = True
+    checks_objects = True
 
     def __init__(
         self,
@@ -102,7 +98,7 @@ class KltFrontend:
         self._validator = FrameValidator(camera, "klt")
         self._right = RightCamera()
         self._delay = RightDelay(camera)
-        self._objects = ObjectReport()
+        self._scene = SceneMotion()
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, ANCHOR_RADIUS_PX)
         self._anchor_fit = AnchorFit(camera, self._grid, self._bank)
         self._new_features = NewFeatures(camera, self._grid, self._bank)
@@ -195,7 +191,7 @@ class KltFrontend:
     def _take_findings(self) -> tuple[Finding, ...]:
         """Return what was found since the last frame."""
         matcher = self._matcher
-        parts = (self._right, self._delay, matcher.turn, matcher.shake, self._objects)
+        parts = (self._right, self._delay, matcher.turn, matcher.shake, self._scene)
         return tuple(found for part in parts for found in part.take_findings())
 
     def _images(self, frame: StereoFrame) -> tuple[FrameImages | None, BoolArray | None]:
@@ -392,7 +388,6 @@ class KltFrontend:
         """
         camera = self._camera
         stereo = images.stereo
-        index = images.frame.index
         rows = seen.nonzero()[0]
         has_depth = (old.has_point & (old.has_right | (not self._needs_right)))[rows]
         deep = has_depth.nonzero()[0]
@@ -407,38 +402,19 @@ class KltFrontend:
         before = old.left.take(rows, axis=0)
         after = found.take(rows, axis=0)
         kept, motion = static_tracks(problem, before, point, has_depth, after, expected, priors)
-        expected_motion = None if prior is None else prior.motion
         near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
         measured = None if prior is None else prior.measured_motion
         if motion is None and measured is not None:
             kept = static_by_prediction(problem, before, after, kept, measured, near_m)
         if motion is not None:
-            after_deep = after.take(deep, axis=0)
-            voting = voters(old.age[rows[deep]])
-            error_px = stereo.disparity_error_px
-            chosen = choose_motion(
-                problem,
-                deep_point,
-                after_deep,
-                motion,
-                expected_motion,
-                voting=voting,
-                in_event=self._objects.active,
-                disparity_error_px=error_px,
+            points = MovedPoints(deep_point, after.take(deep, axis=0), old.age[rows[deep]])
+            chosen = self._scene.choose(
+                images.frame.index, problem, points, motion, prior, stereo.disparity_error_px
             )
-            if stereo.rows_are_off and one_motion_explains(
-                problem, chosen, deep_point, after_deep, error_px
-            ):
-                chosen = replace(chosen, object_share=0.0)
-            if chosen.decision is None and expected_motion is not None and measured is None:
-                chosen = self._objects.questioned(
-                    chosen, camera, deep_point, expected_motion, voting, error_px
-                )
-            motion = chosen.motion
-            kept[has_depth] = chosen.motion.inliers
-            self._objects.frame(index, chosen)
-            if self._objects.hides_scene(index, chosen) and measured is None:
+            if chosen.hidden:
                 return np.zeros(len(old), dtype=np.bool_), None
+            motion = chosen.motion
+            kept[has_depth] = motion.inliers
         if motion is not None and not has_depth.all():
             distance = epipolar_distance(
                 camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m

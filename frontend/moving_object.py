@@ -21,15 +21,19 @@ Nothing tells which: it is used, and reported at once.
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import replace
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from vio.dataclass import dataclass
-from vio.findings import Finder, Finding
 from vio.frontend.columns import share_of
+from vio.frontend.expected_motion import (
+    AGREEMENT_LIMIT,
+    AGREEMENT_PROBABILITY,
+    ExpectedMotion,
+    pixel_D_motion,
+)
 from vio.frontend.outliers import (
     Consensus,
     RansacProblem,
@@ -37,41 +41,27 @@ from vio.frontend.outliers import (
     best_motion,
     pixel_errors,
 )
-from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
-from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
-from vio.numerics.statistics import chi_square_quantile, squared_distance
+from vio.geometry.lie import FloatArray, transform_points
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
+from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, MotionPrior
 
 Decision: TypeAlias = Literal["predicted", "voted", "undecided", "unsupported"]
 
-_PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
-_LIMIT = float(chi_square_quantile(_PROBABILITY, 6))  # of its squared distance
 # ratio of two motions' squared distances from a measured one, above which the nearer agrees
-_CLEARLY_NEARER = 10.0
-_MIN_POINTS = 12  # of a second motion
+CLEARLY_NEARER = 10.0
+MIN_POINTS = 12  # of a second motion
 _MIN_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
 _LARGE_SHARE = 0.25  # share of all points above which a second motion is reported
 # of the smaller group's points that no depth within the disparities' error explains: an object
 _SEEN_SHARE = 0.5
-_BOUND_SIGMAS = 3.0  # of the bound of the disparities' error
-_PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
-# errors of neighbours have much in common: a fit is no better than that of so many points
-_INDEPENDENT_POINTS = 50
 _MIN_STATIC = 0.8  # share of a consensus without depths that a measured motion must explain
 _FAR_M = 1e4  # depth of what is infinitely far away
-# of the length of a fitted translation: depths of one frame have errors in common
-_SCALE_SIGMA = 0.01
 # errors of points of the scene over the median of those that are static for long: of 1000 one more
 _FOLLOWING = 3.2
 _VOTERS = 50  # how many points vote, and for how many frames each must have been static
 _VOTING_FRAMES = 5
 _CLEAR_VOTE = 0.7  # share of the voting points that must follow a motion
-_FRAMES = 5  # in a row before an object is reported
-_EVENT_FRAMES = 2  # in a row before an object is known, and may hide the scene
-# of the points that the scene has, during an event, below which the object hides it …
-_HIDDEN_SHARE = 0.1
-_HIDDEN_FRAMES = 3  # … in so many frames in a row
-_CLEAR_FRAMES = 20  # without one before the next is another event
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,81 +101,191 @@ def choose_motion(
             from, pixels. Where it is not 0, no motion explains all of a static scene, and a
             prediction that is not measured is off with the depths.
     """
-    measured = predicted is not None and predicted.measured
     expected = (
-        None if predicted is None else _Expected(problem.camera, predicted, disparity_error_px)
+        None if predicted is None else ExpectedMotion(problem.camera, predicted, disparity_error_px)
     )
-    if voting is not None and not measured:
-        voted = _voted(problem, p_prev, pixels, found, voting)
-        if voted is not None and not _prediction_overrules(p_prev, found, voted, expected):
-            return TwoMotions(voted, _if_large((found.inliers & ~voted.inliers).mean()), "voted")
-    others = (~found.inliers).nonzero()[0]
-    least = max(_MIN_POINTS, _MIN_SUPPORT * found.inliers.sum())
-    of_first = np.inf
-    is_far = expected is not None and expected.is_beyond(found.T_curr_prev, _LIMIT)
-    if expected is not None and (len(others) >= least or in_event or is_far):
-        of_first = expected.distance(found.T_curr_prev, p_prev[found.inliers])
-    contradicted = is_far and of_first > _LIMIT
-    if expected is not None and measured and contradicted and voting is not None:
-        slow = _without_slow_object(problem, p_prev, pixels, found, expected, voting)
-        if slow is not None:
-            return TwoMotions(slow, _if_large((found.inliers & ~slow.inliers).mean()), "predicted")
-    if len(others) < least and not (in_event or contradicted):
+    case = _Case(problem, p_prev, pixels, found, expected, voting, in_event)
+    chosen = _outvoted(case)
+    if chosen is not None:
+        return chosen
+    first = _judged_first(case)
+    chosen = _freed_of_slow_object(case, first)
+    if chosen is not None:
+        return chosen
+    if len(case.others) < case.min_support and not (in_event or first.contradicted):
         return TwoMotions(found, 0.0, None)
-    second = np.eye(4)
+    second = _second_motion(case, first)
+    chosen = _elected_motion(case, second)
+    return _predicted_motion(case, first, second) if chosen is None else chosen
+
+
+@dataclass(frozen=True)
+class _Case:
+    """What is known of a frame; arguments as of `choose_motion`."""
+
+    problem: RansacProblem
+    p_prev: FloatArray
+    pixels: FloatArray
+    found: Consensus
+    expected: ExpectedMotion | None
+    voting: BoolArray | None
+    in_event: bool
+
+    @property
+    def prior(self) -> MotionPrior | None:
+        """The predicted motion."""
+        return None if self.expected is None else self.expected.prior
+
+    @property
+    def measured(self) -> bool:
+        """Whether a sensor has measured the predicted motion."""
+        return self.prior is not None and self.prior.measured
+
+    @cached_property
+    def others(self) -> IntArray:
+        """Rows (K,) of the points that do not follow the consensus."""
+        return (~self.found.inliers).nonzero()[0]
+
+    @property
+    def min_support(self) -> float:
+        """Points that a second motion needs."""
+        return float(max(MIN_POINTS, _MIN_SUPPORT * self.found.inliers.sum()))
+
+    def followers(self, T: FloatArray) -> BoolArray:
+        """Mask (N,) of the points whose pixels a motion (4, 4) explains."""
+        return _followers(self.problem, T, self.p_prev, self.pixels)
+
+    def without(self, kept: BoolArray) -> float:
+        """The share of points that follow the consensus alone, where it is that of an object."""
+        return _if_large((self.found.inliers & ~kept).mean())
+
+
+@dataclass(frozen=True, slots=True)
+class _First:
+    """The consensus beside the prediction."""
+
+    distance: float  # squared; infinite where it was not needed
+    contradicted: bool  # the prediction, with its covariance and that of the fit, excludes it
+
+
+@dataclass(frozen=True, slots=True)
+class _Second:
+    """The motion of a group that does not follow the consensus."""
+
+    T: FloatArray  # (4, 4); arbitrary where there is no such group
+    support: BoolArray  # (K,) of the points beside the consensus
+    follows: BoolArray  # (N,) of all points; none where there is no group
+    exists: bool
+    object_share: float  # that is reported where the consensus is the camera's motion
+
+
+def _outvoted(case: _Case) -> TwoMotions | None:
+    """The motion of the points that have been static for long, where the consensus is not theirs
+    and no sensor tells.
+    """
+    if case.voting is None or case.measured:
+        return None
+    voted = _voted(case.problem, case.p_prev, case.pixels, case.found, case.voting)
+    if voted is None or _prediction_overrules(case.p_prev, case.found, voted, case.expected):
+        return None
+    return TwoMotions(voted, case.without(voted.inliers), "voted")
+
+
+def _judged_first(case: _Case) -> _First:
+    """Compare the consensus with the prediction, where a decision may need it."""
+    found = case.found
+    expected = case.expected
+    if expected is None:
+        return _First(np.inf, contradicted=False)
+    is_far = expected.is_beyond(found.T_curr_prev, AGREEMENT_LIMIT)
+    distance = np.inf
+    if len(case.others) >= case.min_support or case.in_event or is_far:
+        distance = expected.distance(found.T_curr_prev, case.p_prev[found.inliers])
+    return _First(distance, contradicted=is_far and distance > AGREEMENT_LIMIT)
+
+
+def _freed_of_slow_object(case: _Case, first: _First) -> TwoMotions | None:
+    """The measured motion's own points, where a slow object has dragged the consensus off it."""
+    if not (first.contradicted and case.measured):
+        return None
+    if case.expected is None or case.voting is None:
+        return None
+    slow = _without_slow_object(
+        case.problem, case.p_prev, case.pixels, case.found, case.expected, case.voting
+    )
+    return None if slow is None else TwoMotions(slow, case.without(slow.inliers), "predicted")
+
+
+def _second_motion(case: _Case, first: _First) -> _Second:
+    """The motion of the outliers, or the one near a prediction that the consensus contradicts."""
+    others = case.others
+    T = np.eye(4)
     support = np.zeros(len(others), dtype=np.bool_)
-    if len(others) >= least:
-        starts = np.stack([np.eye(4) if predicted is None else predicted.T_curr_prev, np.eye(4)])
-        second, support = best_motion(problem, p_prev[others], pixels[others], starts)
-    large = bool(support.sum() >= least)
-    reported = _if_large(support.sum() / len(p_prev)) if large else 0.0
+    if len(others) >= case.min_support:
+        prior = case.prior
+        starts = np.stack([np.eye(4) if prior is None else prior.T_curr_prev, np.eye(4)])
+        T, support = best_motion(case.problem, case.p_prev[others], case.pixels[others], starts)
+    exists = bool(support.sum() >= case.min_support)
+    object_share = _if_large(support.sum() / len(case.p_prev)) if exists else 0.0
     # the prediction is that of a body that goes on as before
-    if expected is not None and contradicted and not measured:
-        near = _near_prediction(problem, p_prev, pixels, found, expected)
+    if case.expected is not None and first.contradicted and not case.measured:
+        near = _near_prediction(case.problem, case.p_prev, case.pixels, case.found, case.expected)
         if near is not None:
-            second = near.T_curr_prev
+            T = near.T_curr_prev
             support = near.inliers[others]
-            large = True
-    follows_second = (
-        _followers(problem, second, p_prev, pixels)
-        if large
-        else np.zeros(len(p_prev), dtype=np.bool_)
-    )
-    if large and not measured and voting is not None:
-        elected = _elected(found.inliers[voting], follows_second[voting])
-        if elected == "second":
-            object_share = _if_large((found.inliers & ~follows_second).mean())
-            return TwoMotions(Consensus(second, follows_second), object_share, "voted")
-        if elected == "first":
-            return TwoMotions(found, reported, "voted" if reported else None)
-    if predicted is None or expected is None:
+            exists = True
+    follows = case.followers(T) if exists else np.zeros(len(case.p_prev), dtype=np.bool_)
+    return _Second(T, support, follows, exists, object_share)
+
+
+def _elected_motion(case: _Case, second: _Second) -> TwoMotions | None:
+    """Which of two motions the points follow that have been static for long; None: they do not
+    tell, or a sensor will.
+    """
+    if not second.exists or case.measured or case.voting is None:
+        return None
+    found = case.found
+    elected = _elected(found.inliers[case.voting], second.follows[case.voting])
+    if elected == "second":
+        object_share = case.without(second.follows)
+        return TwoMotions(Consensus(second.T, second.follows), object_share, "voted")
+    if elected == "first":
+        return TwoMotions(found, second.object_share, "voted" if second.object_share else None)
+    return None
+
+
+def _predicted_motion(case: _Case, first: _First, second: _Second) -> TwoMotions:
+    """Which of two motions agrees with the prediction; both may, and neither."""
+    found = case.found
+    reported = second.object_share
+    prior = case.prior
+    if case.expected is None or prior is None:
         return TwoMotions(found, reported, "undecided" if reported else None)
-    if not (large or in_event):
+    if not (second.exists or case.in_event):
         return TwoMotions(found, 0.0, None)
-    of_second = expected.distance(second, p_prev[others[support]]) if large else np.inf
-    nearer, farther = sorted((of_first, of_second))
-    limit = _LIMIT
-    if measured and large and nearer * _CLEARLY_NEARER <= farther:
+    of_second = np.inf
+    if second.exists:
+        of_second = case.expected.distance(second.T, case.p_prev[case.others[second.support]])
+    nearer, farther = sorted((first.distance, of_second))
+    limit = AGREEMENT_LIMIT
+    if case.measured and second.exists and nearer * CLEARLY_NEARER <= farther:
         # the sensor is worse than its covariance, but leaves no doubt which one it is
         limit = max(limit, nearer)
-    first_agrees = of_first <= limit
+    first_agrees = first.distance <= limit
     second_agrees = of_second <= limit
-    if not (second_agrees or in_event or reported):
+    if not (second_agrees or case.in_event or reported):
         return TwoMotions(found, 0.0, None)  # whether the first agrees or not
-    if first_agrees or not (second_agrees or in_event):
-        return TwoMotions(
-            found, reported, "predicted" if first_agrees and not second_agrees else "undecided"
-        )
+    if first_agrees or not (second_agrees or case.in_event):
+        told = first_agrees and not second_agrees
+        return TwoMotions(found, reported, "predicted" if told else "undecided")
+    motion = Consensus(second.T, second.follows)
     if not second_agrees:
-        second = predicted.T_curr_prev
-        follows_second = _followers(problem, predicted.T_curr_prev, p_prev, pixels)
-    return TwoMotions(
-        Consensus(second, follows_second), _if_large(share_of(found.inliers)), "predicted"
-    )
+        motion = Consensus(prior.T_curr_prev, case.followers(prior.T_curr_prev))
+    return TwoMotions(motion, _if_large(share_of(found.inliers)), "predicted")
 
 
 def _prediction_overrules(
-    p_prev: FloatArray, found: Consensus, voted: Consensus, expected: _Expected | None
+    p_prev: FloatArray, found: Consensus, voted: Consensus, expected: ExpectedMotion | None
 ) -> bool:
     """Return whether a prediction agrees with the consensus, and better than with the vote.
 
@@ -197,7 +297,7 @@ def _prediction_overrules(
     of_found, of_voted = (
         expected.distance(each.T_curr_prev, p_prev[each.inliers]) for each in (found, voted)
     )
-    return of_found <= min(of_voted, _LIMIT)
+    return of_found <= min(of_voted, AGREEMENT_LIMIT)
 
 
 def _if_large(share: float) -> float:
@@ -217,7 +317,7 @@ def _near_prediction(
     p_prev: FloatArray,
     pixels: FloatArray,
     found: Consensus,
-    expected: _Expected,
+    expected: ExpectedMotion,
 ) -> Consensus | None:
     """The motion near a predicted one that the consensus contradicts, if some points follow this
     one alone.
@@ -227,15 +327,17 @@ def _near_prediction(
     """
     start = expected.prior.T_curr_prev
     near = pixel_errors(problem.camera, start, p_prev, pixels) <= 2.0 * problem.limit_px
-    if near.sum() < _MIN_POINTS:
+    if near.sum() < MIN_POINTS:
         return None
     T, _ = best_motion(problem, p_prev[near], pixels[near], start[None])
     inliers = _followers(problem, T, p_prev, pixels)
     alone = inliers & ~found.inliers
     others = found.inliers & ~inliers
-    if alone.sum() < max(_MIN_POINTS, _MIN_SUPPORT * others.sum()):
+    if alone.sum() < max(MIN_POINTS, _MIN_SUPPORT * others.sum()):
         return None
-    return Consensus(T, inliers) if expected.distance(T, p_prev[inliers]) <= _LIMIT else None
+    return (
+        Consensus(T, inliers) if expected.distance(T, p_prev[inliers]) <= AGREEMENT_LIMIT else None
+    )
 
 
 def _without_slow_object(
@@ -243,7 +345,7 @@ def _without_slow_object(
     p_prev: FloatArray,
     pixels: FloatArray,
     found: Consensus,
-    expected: _Expected,
+    expected: ExpectedMotion,
     voting: BoolArray,
 ) -> Consensus | None:
     """The motion of the points that have been static for long, and those that follow it as well as
@@ -253,7 +355,7 @@ def _without_slow_object(
     it along.
     """
     old = voting & found.inliers
-    if old.sum() < _MIN_POINTS:
+    if old.sum() < MIN_POINTS:
         return None
     T, _ = best_motion(problem, p_prev[old], pixels[old], expected.prior.T_curr_prev[None])
     errors = pixel_errors(problem.camera, T, p_prev, pixels)
@@ -261,11 +363,11 @@ def _without_slow_object(
     follows = np.asarray(errors <= min(usual_px, problem.limit_px))
     moving = found.inliers & ~follows
     # old points that do not follow: the scene is no better known than what came into view
-    if moving.sum() < max(_MIN_POINTS, _LARGE_SHARE * len(p_prev)):
+    if moving.sum() < max(MIN_POINTS, _LARGE_SHARE * len(p_prev)):
         return None
     if (moving & voting).sum() > (1.0 - _CLEAR_VOTE) * voting.sum():
         return None
-    return Consensus(T, follows) if expected.distance(T, p_prev[old]) <= _LIMIT else None
+    return Consensus(T, follows) if expected.distance(T, p_prev[old]) <= AGREEMENT_LIMIT else None
 
 
 def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] | None:
@@ -276,14 +378,14 @@ def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] 
     """
     for_first = int((first & ~second).sum())
     for_second = int((second & ~first).sum())
-    if max(for_first, for_second) < max(_MIN_POINTS, _CLEAR_VOTE * (for_first + for_second)):
+    if max(for_first, for_second) < max(MIN_POINTS, _CLEAR_VOTE * (for_first + for_second)):
         return None
     return "first" if for_first > for_second else "second"
 
 
 def _votes_for(found: Consensus, voting: BoolArray) -> bool:
     """Whether most of the voting points (N,) follow a motion."""
-    return bool(voting.sum() >= _MIN_POINTS and found.inliers[voting].mean() >= _CLEAR_VOTE)
+    return bool(voting.sum() >= MIN_POINTS and found.inliers[voting].mean() >= _CLEAR_VOTE)
 
 
 def _voted(
@@ -296,7 +398,7 @@ def _voted(
     """Return the motion that most of the voting points (N,) follow, where the consensus is not
     theirs; else None.
     """
-    if voting.sum() < _MIN_POINTS or _votes_for(found, voting):
+    if voting.sum() < MIN_POINTS or _votes_for(found, voting):
         return None
     starts = np.stack([found.T_curr_prev, np.eye(4)])
     T, follows = best_motion(problem, p_prev[voting], pixels[voting], starts)
@@ -331,7 +433,7 @@ def static_by_prediction(
         near_m: the smallest depth.
     """
     static = _agree_with(problem.camera, predicted, before, after, near_m, problem.limit_px)
-    if static.sum() < _MIN_POINTS or share_of(static[kept]) >= _MIN_STATIC:
+    if static.sum() < MIN_POINTS or share_of(static[kept]) >= _MIN_STATIC:
         return kept
     return static
 
@@ -367,11 +469,11 @@ def _agree_with(
     p = turned / np.clip(inverse, 1.0 / _FAR_M, 1.0 / near_m)[:, None] + T[:3, 3]
     ahead = depth_of(camera, p) > 0.0
     p[~ahead] = [0.0, 0.0, 1.0]
-    J = _pixel_D_motion(camera, p)
+    J = pixel_D_motion(camera, p)
     S = J @ predicted.covariance @ J.transpose(0, 2, 1) + sigma_px**2 * np.eye(2)
     d = after - project(camera, p)[:, :2]
     squared = np.sum(d * np.linalg.solve(S, d[..., None])[..., 0], axis=1)
-    return np.asarray(ahead & (squared <= float(chi_square_quantile(_PROBABILITY, 1))))
+    return np.asarray(ahead & (squared <= float(chi_square_quantile(AGREEMENT_PROBABILITY, 1))))
 
 
 def one_motion_explains(
@@ -436,54 +538,6 @@ def _within_depths(
     return np.asarray((place_px >= -limit) & (place_px <= length + limit))
 
 
-@dataclass(frozen=True, slots=True)
-class _Expected:
-    """A predicted motion, and what fits to points are off by beside it."""
-
-    camera: StereoCamera
-    prior: MotionPrior
-    disparity_error_px: float  # see `choose_motion`
-
-    def distance(self, T: FloatArray, p_prev: FloatArray) -> float:
-        """Squared distance of a motion (4, 4), fitted to points (N, 3), from the prediction, over
-        their covariance.
-        """
-        p = transform_points(T, p_prev)
-        J = _pixel_D_motion(self.camera, p).reshape(-1, 6)
-        points = min(len(p), _INDEPENDENT_POINTS)
-        fit = _PIXEL_SIGMA**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
-        moved_m2 = float(T[:3, 3] @ T[:3, 3])
-        fit[:3, :3] += _SCALE_SIGMA**2 * moved_m2 * np.eye(3)
-        if self.disparity_error_px > 0.0:
-            # a translation is off as its depths are; one that no sensor has measured is, too
-            depth = float(np.median(depth_of(self.camera, p_prev)))
-            f_baseline = self.camera.fu * self.camera.baseline_m
-            scale = self.disparity_error_px / _BOUND_SIGMAS * depth / f_baseline
-            if not self.prior.measured:
-                t = self.prior.T_curr_prev[:3, 3]
-                moved_m2 += float(t @ t)
-            fit[:3, :3] += scale**2 * moved_m2 * np.eye(3)
-        return self._distance(T, self.prior.covariance + fit)
-
-    def is_beyond(self, T: FloatArray, limit: float) -> bool:
-        """Whether a motion (4, 4) is further off than a limit over the prediction's covariance
-        alone: that of a fit to points is added only if it is.
-        """
-        return self._distance(T, self.prior.covariance) > limit
-
-    def _distance(self, T: FloatArray, covariance: FloatArray) -> float:
-        xi = se3_log(T @ se3_inverse(self.prior.T_curr_prev))
-        return squared_distance(xi, covariance, 0.0)
-
-
-def _pixel_D_motion(camera: StereoCamera, p: FloatArray) -> FloatArray:
-    """Jacobian (N, 2, 6) of the left pixels of points (N, 3) by the camera's motion,
-    `[rho; phi]`.
-    """
-    J: FloatArray = z_D_p_cam(camera, p)[:, :2] @ circledot(p)[:, :3]
-    return J
-
-
 def voters(age: IntArray) -> BoolArray:
     """Which points (N,), static for some frames (N,), have a vote: the oldest of those that are not
     new.
@@ -493,141 +547,3 @@ def voters(age: IntArray) -> BoolArray:
     """
     oldest = np.partition(age, len(age) - _VOTERS)[len(age) - _VOTERS] if len(age) > _VOTERS else 0
     return np.asarray(age >= max(oldest, _VOTING_FRAMES))
-
-
-class ObjectReport(Finder):
-    """Reports once per event that an object covers much of the image, and what decided which
-    motion is the camera's.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        # squared distances from the prediction of motions that older points support
-        self._usual = deque[float](maxlen=_CLEAR_FRAMES)
-        self._frames = 0  # with an object, in a row
-        self._since = 0  # the first of them
-        self._clear = 0  # without one, in a row
-        self._hidden = 0  # that an object hides, in a row
-        self._reported: str | None = None  # code of the event that goes on
-        self._hidden_reported = False
-        self._active = False
-
-    @property
-    def active(self) -> bool:
-        """Whether the prediction has distinguished an object from the scene in some of the last
-        frames.
-        """
-        return self._active
-
-    def questioned(
-        self,
-        motions: TwoMotions,
-        camera: StereoCamera,
-        p_prev: FloatArray,
-        predicted: MotionPrior,
-        voting: BoolArray,
-        disparity_error_px: float,
-    ) -> TwoMotions:
-        """Return the motions of a frame, as unsupported ones where the camera's is far off an
-        extrapolated prediction, and no older point supports it.
-
-        Arguments as of `choose_motion`; the camera's motion is the only one.
-        """
-        motion = motions.motion
-        expected = _Expected(camera, predicted, disparity_error_px)
-        supported = int((motion.inliers & voting).sum()) >= _MIN_POINTS
-        limit = _LIMIT if supported else _CLEARLY_NEARER * max([_LIMIT, *self._usual])
-        distance = 0.0
-        if expected.is_beyond(motion.T_curr_prev, limit):
-            distance = expected.distance(motion.T_curr_prev, p_prev[motion.inliers])
-        if supported:
-            self._usual.append(distance)
-        if supported or not self._usual or distance <= limit:
-            return motions
-        return replace(motions, object_share=share_of(motion.inliers), decision="unsupported")
-
-    def hides_scene(self, index: int, motions: TwoMotions) -> bool:
-        """Return whether a known object has left too few points of the scene for some frames, so
-        that none is used.
-        """
-        hidden = self._active and float(motions.motion.inliers.mean()) < _HIDDEN_SHARE
-        self._hidden = self._hidden + 1 if hidden else 0
-        if self._hidden >= _HIDDEN_FRAMES and not self._hidden_reported:
-            self._hidden_reported = True
-            message = (
-                f"frame {index}: fewer than {100 * _HIDDEN_SHARE:.0f} % of the points are left of "
-                "the scene: the object hides it, and no feature is used"
-            )
-            self._found.append(Finding("object-hides-scene", message, index, lasts=True))
-        return self._hidden >= _HIDDEN_FRAMES
-
-    def frame(self, index: int, motions: TwoMotions) -> None:
-        """Take the motions of a frame."""
-        if motions.object_share == 0.0:
-            self._no_object(index)
-            return
-        if self._frames == 0:
-            self._since = index
-        self._frames = self._frames + 1
-        self._clear = 0
-        if motions.decision == "unsupported":
-            self._report_unsupported(index, motions)
-            return
-        undecided = motions.decision == "undecided"
-        self._active = self._active or (self._frames >= _EVENT_FRAMES and not undecided)
-        if self._frames >= _FRAMES and self._reported is None:
-            self._report(index, motions)
-
-    def _no_object(self, index: int) -> None:
-        self._frames = 0
-        self._clear = self._clear + 1
-        self._active = self._active and self._clear < _FRAMES
-        if self._reported is None or self._clear < _CLEAR_FRAMES:
-            return
-        message = f"frame {index}: no object covers much of the image any more"
-        self._found.append(Finding(self._reported, message, index, ended=True))
-        if self._hidden_reported:
-            self._found.append(Finding("object-hides-scene", message, index, ended=True))
-        self._reported = None
-        self._hidden_reported = False
-
-    def _report_unsupported(self, index: int, motions: TwoMotions) -> None:
-        if self._reported == "object-or-scene":
-            return
-        if self._reported is not None:
-            self._found.append(
-                Finding(self._reported, f"frame {index}: see below", index, ended=True)
-            )
-        self._reported = "object-or-scene"
-        share = round(100 * motions.object_share)
-        message = (
-            f"frame {index}: {share} % of the points move as the rig did not before, and hardly "
-            "one of them was seen before: the rig was pushed, or an object hides the scene; they "
-            "are taken for the scene"
-        )
-        figures = {"object_share": motions.object_share}
-        self._found.append(
-            Finding("object-or-scene", message, index, index, lasts=True, figures=figures)
-        )
-
-    def _report(self, index: int, motions: TwoMotions) -> None:
-        share = round(100 * motions.object_share)
-        self._reported = "object-covers-image"
-        by = "the points seen before" if motions.decision == "voted" else "its predicted motion"
-        message = (
-            f"frame {index}: {share} % of the points move together, but not as the camera does by "
-            f"{by}: an object that moves on its own covers much of the image; its points are left "
-            "out"
-        )
-        if motions.decision == "undecided":
-            self._reported = "object-or-scene"
-            rest = round(100 * float(motions.motion.inliers.mean()))
-            message = (
-                f"frame {index}: two groups of points move differently, {rest} % and {share} % of "
-                "all: an object that moves on its own covers much of the image, and the predicted "
-                "motion does not tell which group it is; the larger one is taken for the scene"
-            )
-        figures = {"object_share": motions.object_share}
-        self._found.append(
-            Finding(self._reported, message, index, self._since, lasts=True, figures=figures)
-        )

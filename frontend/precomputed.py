@@ -29,10 +29,11 @@ class PrecomputedFrontend:
     ) -> None:
         """Take what returns the observations of a frame by its index, such as
         `Dataset.observations`; `checks_matches`: a run of this package made them, and has checked
-        their right matches.
+        them.
         """
         self._source = source
         self.checks_matches = checks_matches
+        self.checks_objects = checks_matches
         # frames by which the right pixels are late, as `vio.guard.repairing.repaired` has it
         self.right_delay = 0
         self._previous: IntArray = np.zeros(0, dtype=np.int64)

@@ -45,8 +45,6 @@ class _StereoRules(NamedTuple):
     # share of features with a right match below which other row differences are tried
     few_matches: float = 0.2
     good_match: float = 0.9  # correlation of patches whose rows agree
-    # root mean square over the matches: from here on the run reports the calibration, too
-    rows_off_px: float = 0.2
     row_search_frames: int = 10  # between two such searches, while matches are few
     # of the image width: largest disparity that is searched where the scene is near
     max_reach: float = 0.64
@@ -63,8 +61,6 @@ class _StereoRules(NamedTuple):
 _STEREO = _StereoRules()
 _MAX_ROW_DIFFERENCE_PX = 1.0  # of a match, after the estimated row differences are subtracted
 _MIN_POINTS = 20
-# the third of three like angles over the root mean square of two, at most, at 99 %
-_THIRD_ANGLE = 7.0
 # A pair turns so much in its mount, three times the prior of its calibration, or exposes so far
 # apart.
 _MAX_TURN_RAD = 0.3 * np.pi / 180.0
@@ -316,22 +312,9 @@ class StereoFit:
         return self._unmatched > 0
 
     @property
-    def rows_are_off(self) -> bool:
-        """Whether the rows of the matches differ by a smooth field: the calibration is off, and
-        so are the depths.
-        """
-        return self._rows.rms_px >= _STEREO.rows_off_px
-
-    @property
     def disparity_error_px(self) -> float:
-        """Bound of the error of disparities that the rows suggest, pixels; 0: they agree.
-
-        Of three like angles of a mount, two shift rows: the third is of their size, and Student's t
-        with two degrees of freedom bounds it. What it does to the rows itself is added.
-        """
-        if not self.rows_are_off:
-            return 0.0
-        return _THIRD_ANGLE * self._rows.rms_px + self._rows.disparity_px(self._camera.fu)
+        """Bound of the error of disparities that the rows suggest, pixels; 0: they agree."""
+        return self._rows.disparity_error_px(self._camera.fu)
 
     def row_differences(self, left: FloatArray) -> FloatArray:
         """Right minus left rows (N,) that are expected at left pixels (N, 2)."""

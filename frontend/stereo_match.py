@@ -26,6 +26,10 @@ _FIELD_MEMORY = 0.95  # forgetting factor of previous frames, per frame
 _FIELD_PRIOR = 4.0  # weight of the prior of zero row difference, in matches
 _FIELD_SIGMA_PX = 0.5
 _FIELD_ITERATIONS = 3
+# root mean square of the row differences: from here on the run reports the calibration, too
+_ROWS_OFF_PX = 0.2
+# the third of three like angles over the root mean square of two, at most, at 99 %
+_THIRD_ANGLE = 7.0
 
 Scores = npt.NDArray[np.float32]  # correlations, and what they are computed from
 
@@ -55,6 +59,23 @@ class EpipolarRowModel:
     def offset_px(self) -> float:
         """Row difference at the image's centre, pixels."""
         return float(self._field[0])
+
+    @property
+    def are_off(self) -> bool:
+        """Whether the rows of the matches differ by a smooth field: the calibration is off, and
+        so are the depths.
+        """
+        return self.rms_px >= _ROWS_OFF_PX
+
+    def disparity_error_px(self, focal_px: float) -> float:
+        """Bound of the error of disparities that the rows suggest, pixels; 0: they agree.
+
+        Of three like angles of a mount, two shift rows: the third is of their size, and Student's t
+        with two degrees of freedom bounds it. What it does to the rows itself is added.
+        """
+        if not self.are_off:
+            return 0.0
+        return _THIRD_ANGLE * self.rms_px + self.disparity_px(focal_px)
 
     def disparity_px(self, focal_px: float) -> float:
         """Size of the common error of disparities, pixels, of the yaw that the rows show.

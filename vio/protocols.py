@@ -136,6 +136,17 @@ class ChecksMatches(Protocol):
         """Whether those of the last frame are checked."""
 
 
+@runtime_checkable
+class ChecksObjects(Protocol):
+    """A front end that tells objects that cover much of the image from the scene itself, so that
+    `vio.guard` need not.
+    """
+
+    @property
+    def checks_objects(self) -> bool:
+        """Whether the features of the last frame are of the scene."""
+
+
 class Selector(Protocol):
     """Decides which observations enter the filter's update."""
 

@@ -581,6 +581,8 @@ class UpdateReport:
     started: bool = True  # False: nothing can be estimated yet, and the frame has no pose
     # by which the gyro's bias has jumped, rad/s, as the images show; None: it has not
     gyro_jump_radps: float | None = None
+    # by what the scale may be off, over it, as the motion sensor suggests, beside what is considered
+    scale_doubt: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -134,3 +134,46 @@ def test_information_that_rounding_makes_negative_is_passed_over() -> None:
     test.end_frame()
     assert test.estimate() == before
     assert not test.is_confirmed
+
+
+def measured(log: float, sigma: float) -> ScaleTest:
+    """A test that has measured a logarithm of the scale with a standard deviation."""
+    test = ScaleTest()
+    H = np.array([1.0])
+    test.absorb(H, H / sigma**2, np.array([log / sigma**2]), np.zeros((1, 1)))
+    return test
+
+
+def test_without_a_measurement_the_calibrated_scale_counts() -> None:
+    assert ScaleTest().doubt() == 0.0
+
+
+def test_the_doubt_is_the_mixture_of_a_right_and_a_wrong_calibration() -> None:
+    """Its weights by sampling: calibrations are drawn, and those kept that show what was measured."""
+    log, sigma = 0.05, 0.02
+    rng = np.random.default_rng(5)
+    draws = 2_000_000
+    is_wrong = rng.random(draws) < 0.25
+    scale = np.where(is_wrong, rng.normal(0.0, 0.1, draws), 0.0)
+    shown = scale + rng.normal(0.0, np.where(is_wrong, sigma, np.hypot(sigma, 0.02)))
+    kept = np.abs(shown - log) < 0.002
+    mean = scale[kept & is_wrong].mean()
+    expected = np.sqrt(is_wrong[kept].mean()) * mean
+    assert measured(log, sigma).doubt() == pytest.approx(expected, rel=0.05)
+
+
+def test_the_doubt_covers_what_is_measured_clearly_and_is_small_where_the_sensor_agrees() -> None:
+    assert measured(0.08, 0.01).doubt() > 0.07
+    assert measured(0.01, 0.01).doubt() < 0.005
+
+
+def test_what_an_imu_says_of_a_wrong_baseline_is_in_the_covariance() -> None:
+    flight = Shaking(240)
+    settings = replace(OFF, stereo_baseline_sigma=0.003)
+    short = replace(HAND_HELD, baseline_m=HAND_HELD.baseline_m / 1.1)
+    for camera, low, high in ((short, 0.05, 0.15), (HAND_HELD, 0.0, 0.02)):
+        run = _fly(flight, settings, 0, xi=np.zeros(6), offset_s=0.0, camera=camera)
+        last = max(run.estimates[200:], key=lambda e: float(np.linalg.norm(e.T_world_imu[:3, 3])))
+        sigma_m = float(np.sqrt(np.trace(last.covariance[:3, :3])))
+        share = sigma_m / float(np.linalg.norm(last.T_world_imu[:3, 3]))
+        assert low <= share <= high

@@ -20,13 +20,13 @@ from tests.frontend.test_frontend_outliers import (
 from tests.guards import lines_of
 from vio.frontend.klt import KltFrontend
 from vio.frontend.moving_object import (
-    ObjectReport,
     TwoMotions,
     choose_motion,
     one_motion_explains,
     static_by_prediction,
     voters,
 )
+from vio.frontend.object_report import ObjectReport
 from vio.frontend.outliers import Consensus, pixel_errors, rigid_consensus
 from vio.frontend.patches import ImageLevels
 from vio.frontend.prediction import usable_prior
@@ -366,6 +366,19 @@ def test_an_object_is_reported_once_per_event_with_what_decided() -> None:
     (line,) = lines_during(range(70, 80), undecided)
     assert "60 % and 40 % of all" in line
     assert "does not tell which group it is; the larger one is taken for the scene" in line
+
+
+@pytest.mark.parametrize(("every", "named"), [(3, True), (4, False)])
+def test_a_slow_object_that_some_frames_show_is_reported(every: int, named: bool) -> None:
+    """Moving by whole pixels now and then, it follows the scene's motion in between."""
+    everything = Consensus(np.eye(4), np.ones(10, dtype=np.bool_))
+    report = ObjectReport()
+    for k in range(24):
+        object_share = 0.4 if k % every == 0 else 0.0
+        report.frame(k, TwoMotions(everything, object_share, "voted" if object_share else None))
+    found = report.take_findings()
+    assert [f.code for f in found] == (["object-covers-image"] if named else [])
+    assert [f.since for f in found] == ([0] if named else [])
 
 
 def _lines(p: FloatArray, z: FloatArray, uv: FloatArray) -> list[str]:

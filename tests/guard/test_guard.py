@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,16 +14,21 @@ import pytest
 
 from tests.frontend.test_frontend_scene import CAMERA, flight, stereo_frame
 from tests.guards import codes
+from tools.faults.cameras import Wall, moving_object
+from tools.faults.changes import Changed, Period
 from vio.findings import CODES
 from vio.frontend import build_frontend
 from vio.frontend.precomputed import PrecomputedFrontend
 from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.guard.guarded import GuardedFrontend, guarded
-from vio.guard.pairing import find_delay, told_delay
+from vio.guard.image_check import images_of
+from vio.guard.pairing import PairingCheck, find_delay, told_delay
+from vio.guard.probe import RowProbe
 from vio.guard.repairing import repaired
 from vio.records import (
     FrontendOutput,
     ImuSample,
+    Recording,
     StereoFrame,
     TrackPrior,
     no_features,
@@ -123,6 +130,39 @@ def test_a_right_camera_that_turns_is_reported_by_its_rows(name: str) -> None:
     assert [bool(o.observations.has_right.any()) for o in outputs] == [k < 7 for k in range(FRAMES)]
 
 
+def with_wall(name: str) -> list[FrontendOutput]:
+    """Outputs of a front end, with a wall that moves over half of the image from frame 6 on."""
+    recording = Recording(
+        "images", Path("made"), CAMERA, None, np.arange(FRAMES), True, frozenset(), None
+    )
+    dataset = Changed(None, recording, iter)  # type: ignore[arg-type]
+    begin_ns = frames()[6].time_ns
+    wall = moving_object(dataset, Period(begin_ns, 10**18), Wall(6.0, 0.5, 0.3, 20))
+    frontend = guarded(build_frontend(name, CAMERA, SETTINGS), CAMERA)
+    outputs = []
+    for frame in frames():
+        left, right = wall(frame, frame.left, frame.right)
+        outputs.append(frontend.process(replace(frame, left=left, right=right)))
+    return outputs
+
+
+def test_an_object_over_half_the_image_is_named_where_few_points_live_long() -> None:
+    """Those of ORB do not tell which group is the scene."""
+    assert codes(with_wall("orb")) == ["object-or-scene"]
+
+
+@pytest.mark.parametrize("name", ["klt", "sift"])
+def test_an_object_over_half_the_image_is_named_and_not_output(name: str) -> None:
+    """It comes when the scene has been seen for some frames; both have as much texture."""
+    outputs = with_wall(name)
+    assert codes(outputs) == ["object-covers-image"]
+    for before, output in pairwise(outputs[7:]):
+        u = output.observations.z[np.isin(output.observations.ids, before.observations.ids), 0]
+        covered = (u > 0.33 * CAMERA.width) & (u < 0.77 * CAMERA.width)
+        assert covered.mean() < 0.1
+        assert (~covered).sum() > 20
+
+
 @pytest.mark.parametrize("name", ["orb", "sift"])
 def test_frames_with_a_frozen_left_image_give_no_features(name: str) -> None:
     outputs = run(name, _frozen_left)
@@ -190,6 +230,23 @@ def shifted(delay: int) -> list[StereoFrame]:
 @pytest.mark.parametrize("delay", range(-3, 4))
 def test_finds_by_how_many_frames_right_images_are_late(delay: int) -> None:
     assert find_delay(shifted(delay), CAMERA) == delay
+
+
+@pytest.mark.parametrize("delay", [-1, 1])
+def test_rows_that_were_found_before_hide_no_delay(delay: int) -> None:
+    """Images of two times may match best at rows that are those of no camera."""
+    probe = RowProbe()
+    pair = images_of(frames()[0], pair=True)
+    assert pair is not None
+    left, right = pair.halves
+    probe.positive(left, np.roll(right, 6, axis=0), probe.corners(left))
+    assert probe.on_rows(left, np.roll(right, 6, axis=0), probe.corners(left)) > 0
+    check = PairingCheck(probe)
+    for frame in shifted(delay):
+        images = images_of(frame, pair=True)
+        assert images is not None
+        check.inspect(images)
+    assert check.delay == delay
 
 
 @pytest.mark.parametrize("rows", [-4, -3, -2, -1, 1, 2, 3, 4])

@@ -25,6 +25,7 @@ from vio.guard.guarded import GuardedFrontend
 from vio.guard.lost_matches import LostMatches
 from vio.guard.match_check import Hysteresis, SharedMatches, shared_matches
 from vio.guard.matches import RightMatches
+from vio.guard.object_matches import ObjectMatches
 from vio.records import Observations, Recording, StereoFrame, Trajectory, observations
 from vio.runs.pipeline import RunResult, run
 
@@ -39,6 +40,7 @@ CODES = {
     "right dark": ["right-matches-lost", "-right-matches-lost"],
     "right late": ["pairs-shifted"],
     "right rolled": ["right-contradicts-left"],
+    "object": ["object-covers-image"],
 }
 
 
@@ -75,8 +77,9 @@ def changed(change: ColumnChange, seen: Sequence[Observations]) -> list[Observat
 
 def inspected(seen: Sequence[Observations]) -> tuple[list[Observations], list[Finding]]:
     checks = RightMatches(CAMERA)
-    out = [checks.inspect(o) for o in seen]
-    return out, list(checks.take_findings())
+    objects = ObjectMatches(CAMERA)
+    out = [objects.inspect(checks.inspect(o), None) for o in seen]
+    return out, [*checks.take_findings(), *objects.take_findings()]
 
 
 def codes(findings: Sequence[Finding]) -> list[str]:
@@ -100,6 +103,29 @@ def test_no_right_pixel_of_a_fault_is_output(name: str) -> None:
     out, _ = inspected(changed(COLUMNS[name], flight()))
     assert not any(out[k].has_right.any() for k in FAULT)
     assert all(out[k].has_right.all() for k in range(FAULT.start))
+
+
+def test_only_features_of_the_scene_are_output_beside_an_object() -> None:
+    """At first sight nothing tells; the wall is half of the image, and has most of the features."""
+    seen = flight()
+    covered = changed(COLUMNS["object"], seen)
+    out, _ = inspected(covered)
+    for k in FAULT[2:]:
+        known = np.isin(covered[k].ids, covered[k - 1].ids)
+        wall = known & ~np.isin(covered[k].ids, seen[k].ids)
+        scene = known & ~wall
+        kept = np.isin(covered[k].ids, out[k].ids)
+        assert wall.sum() > 0.5 * known.sum()
+        assert kept[wall].mean() < 0.05
+        assert kept[scene].mean() > 0.95
+    assert all(a is b for a, b in zip(out[: FAULT.start], seen, strict=False))
+
+
+def test_features_that_scatter_are_no_object() -> None:
+    objects = ObjectMatches(CAMERA)
+    seen = flight(noise_px=4.0)
+    assert all(objects.inspect(o, None) is o for o in seen)
+    assert codes(objects.take_findings()) == []
 
 
 def test_exchanged_pixels_are_put_back_to_the_bit() -> None:

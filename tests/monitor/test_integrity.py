@@ -180,3 +180,51 @@ def test_the_page_of_findings_is_that_of_todays_codes() -> None:
         "run: python -m tools.findings_page > docs/findings.md"
     )
     assert all(f"| `{name}` |" in page() for name in CODES)
+
+
+# The scale
+
+
+def scales_of(doubts: list[float]) -> list[float]:
+    """What each frame's covariance has of the scale's doubt in the end, by its own and by marks."""
+    monitor = IntegrityMonitor()
+    variance = np.zeros(len(doubts))
+    for k, doubt in enumerate(doubts):
+        monitor.take_scale_doubt(k, doubt)
+        for mark in monitor.take_marks():
+            assert mark.before <= k
+            variance[mark.since : mark.before] += mark.scale**2
+        variance[k] += doubt**2
+    return np.sqrt(variance).tolist()
+
+
+@pytest.mark.parametrize(
+    "doubts",
+    [
+        [0.0, 0.0, 0.03, 0.03, 0.08, 0.08],
+        [0.0, 0.1, 0.001, 0.0, 0.05, 0.05],  # the first frames were misled
+        [0.0, 0.02, 0.01, 0.03, 0.0, 0.015, 0.06],
+    ],
+)
+def test_earlier_frames_get_what_later_ones_say_of_the_scale(doubts: list[float]) -> None:
+    """To within a level, and hardly more than that of any frame."""
+    final = scales_of(doubts)
+    for k, sigma in enumerate(final):
+        assert sigma >= max(doubts[k:]) / 1.5
+        assert sigma <= 1.5 * max(doubts)
+
+
+def test_a_small_doubt_of_the_scale_marks_nothing() -> None:
+    monitor = IntegrityMonitor()
+    for k in range(10):
+        monitor.take_scale_doubt(k, 0.004)
+    assert monitor.take_marks() == ()
+
+
+def test_a_mark_of_the_scale_changes_the_covariance_alone() -> None:
+    given = estimate(3)
+    changed = marked(given, Mark(0, 5, "nominal", None, 0.05), 0.1)
+    assert (changed.integrity, changed.findings) == ("nominal", ())
+    np.testing.assert_allclose(
+        np.diag(changed.covariance - given.covariance), [0.01, 0.01, 0.01, 0, 0, 0]
+    )

@@ -1,4 +1,4 @@
-"""Faults of the right camera as features show them: the columns of `Observations` are changed.
+"""Faults of the right camera, and an object, as features show them: the columns of `Observations` are changed.
 
 What a front end of another program gives has no images that could be looked at. Each change takes
 what a frame shows, and gives what it shows with the fault.
@@ -17,7 +17,7 @@ from vio.datasets.features import FeatureDataset
 from vio.frontend.precomputed import with_right_of
 from vio.geometry.lie import FloatArray, so3_exp
 from vio.geometry.stereo import StereoCamera
-from vio.records import Observations, Recording, feature_tracks
+from vio.records import Observations, Recording, feature_tracks, observations
 
 # of what all frames show, the number of one of them, the camera and the period
 ColumnChange: TypeAlias = Callable[
@@ -98,12 +98,49 @@ def _rolled(degrees: float) -> ColumnChange:
     return rolled
 
 
+_WALL_ID = 10**9  # of the first feature of the wall
+_WALL_SHARE = 0.25, 0.75  # what it covers of the image's width
+_WALL_SPEED_PX = 6.0  # a frame, to the left
+_WALL_DISPARITY_PX = 30.0
+_WALL_FEATURES = 12_000  # of its texture, 20 images wide: more than a scene has
+_WALL_NOISE_PX = 0.2
+
+
+def _object(
+    seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
+) -> Observations:
+    """A wall that moves sideways before the cameras; it hides half of the features."""
+    now = seen[k]
+    width = camera.width or round(2 * camera.cu)
+    height = camera.height or round(2 * camera.cv)
+    begin, end = (share * width for share in _WALL_SHARE)
+    scene = now.take((now.z[:, 0] < begin) | (now.z[:, 0] >= end))
+    rng = np.random.default_rng(7)
+    texture = rng.uniform([0.0, 0.0], [20.0 * width, height], (_WALL_FEATURES, 2))
+    first = min(o.frame_index for o in seen if period.holds(o.time_ns))
+    left = texture - [_WALL_SPEED_PX * (now.frame_index - first), 0.0]
+    ids = np.flatnonzero((left[:, 0] >= begin) & (left[:, 0] < end))
+    left = left[ids]
+    z = np.column_stack([left, left - [_WALL_DISPARITY_PX, 0.0]])
+    z += np.random.default_rng(now.frame_index).normal(0.0, _WALL_NOISE_PX, z.shape)
+    wall = observations(now.frame_index, now.time_ns, ids + _WALL_ID, z)
+    return Observations(
+        now.frame_index,
+        now.time_ns,
+        np.concatenate([scene.ids, wall.ids]),
+        np.concatenate([scene.z, wall.z]),
+        np.concatenate([scene.has_right, wall.has_right]),
+        np.concatenate([scene.stale, wall.stale]),
+    )
+
+
 COLUMNS: dict[str, ColumnChange] = {
     "right frozen": during(_frozen),
     "exchanged": during(_exchanged),
     "right dark": during(_dark),
     "right late": _late,
     "right rolled": onwards(_rolled(1.0)),
+    "object": during(_object),
 }
 
 

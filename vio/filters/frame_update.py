@@ -244,6 +244,7 @@ class FrameUpdate:
             landmark_ids=window.landmark_ids.copy(),
             innovation_ratio=innovation_ratio,
             gyro_jump_radps=jump_radps,
+            scale_doubt=self._rig.scale_doubt(window),
         )
 
     def _doubts_gyro(self, window: Window, turn: FloatArray, tracks: LinearTracks) -> bool:
@@ -558,7 +559,7 @@ class FrameUpdate:
         V = window.prior.error_D_constants[:size, 1:]
         if considered is not None:
             V = V - P @ (A[:size, :size] @ V + considered[:size])
-        reported = P + self._rig.uncertainty(window, V)
+        reported = P + self._rig.reported_uncertainty(window, V)
         self._propagation.posterior = FramePosterior.of(window, P)
         self._propagation.reported = FramePosterior.of(window, reported)
         self.smoothed = WindowPosterior.of(window, P, reported)

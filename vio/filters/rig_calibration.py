@@ -158,6 +158,18 @@ class RigCalibration:
         out: FloatArray = V @ V.swapaxes(-1, -2)
         return out
 
+    def scale_doubt(self, window: Window) -> float:
+        """By what the motion sensor suggests that the baseline is off, as a standard deviation over
+        it, beside the one considered; 0 where the settings say that it is known.
+        """
+        test = window.prior.scale_test
+        return 0.0 if test is None or self._sigmas[0] == 0.0 else test.doubt()
+
+    def reported_uncertainty(self, window: Window, V: FloatArray) -> FloatArray:
+        """Return `uncertainty` (k, k) with what the motion sensor says against the scale."""
+        by_scale = V[:, 0] * self.scale_doubt(window)
+        return self.uncertainty(window, V) + np.outer(by_scale, by_scale)
+
     def landmark_covariances(self, window: Window) -> FloatArray:
         """Covariances (M, 3, 3) of the landmarks in the state, with what is considered."""
         first = window.state.landmarks.start

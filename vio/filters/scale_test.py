@@ -27,6 +27,12 @@ _SIGMAS = 5.0
 # part: 0.1 of information on a recording of standstill, with more where the real noise is that of
 # the settings. One is allowed for.
 _BY_NOISE = 1.0
+# Of rigs whose scale is as calibrated, what the test finds has this standard deviation beside its
+# own: half of the least that it reports.
+_USUAL_SIGMA = 0.5 * _MIN
+# Weight of a wrong calibration before anything was measured. What it adds is small where the sensor
+# agrees, whatever the weight.
+_WRONG_SHARE = 0.25
 # A velocity's squared standard deviations beyond which its own error makes less than 3 % of what it
 # says of the scale.
 _CLEAR = 100.0
@@ -97,6 +103,24 @@ class ScaleTest:
     def estimate(self) -> tuple[float, float]:
         """Logarithm of the true scale over the filter's, and its standard deviation."""
         return self._vector / self._information, self._information**-0.5
+
+    def doubt(self) -> float:
+        """By what the scale may be off beside what is reported, as a standard deviation over it.
+
+        The calibration is right, or it is not and the scale is anywhere: a mixture of two normal
+        distributions, whose weights follow from what was measured by Bayes' rule. Without a
+        measurement it is zero: then the calibration counts.
+        """
+        measured = self._information - _SIGMA**-2
+        if measured <= 0.0:
+            return 0.0
+        log = self._vector / measured
+        variances = np.array([_USUAL_SIGMA, _SIGMA]) ** 2 + 1.0 / measured
+        squared = log**2 / variances
+        likelihood = np.exp(-0.5 * (squared - squared[1]))  # over that of a wrong calibration
+        weights = likelihood / np.sqrt(variances) * [1.0 - _WRONG_SHARE, _WRONG_SHARE]
+        wrong = float(weights[1] / weights.sum())
+        return float(np.sqrt(wrong) * abs(self.estimate()[0]))
 
     @property
     def _contradicted(self) -> bool:

@@ -11,10 +11,11 @@ from vio.guard.frozen_image import FrozenCamera
 from vio.guard.image_check import FrameImages, ImageCheck, images_of
 from vio.guard.match_check import without_right
 from vio.guard.matches import RightMatches
+from vio.guard.object_matches import ObjectMatches
 from vio.guard.pairing import PairingCheck
 from vio.guard.probe import RowProbe
 from vio.guard.swap import SwapDetector
-from vio.protocols import ChecksMatches, FollowsRight, Frontend
+from vio.protocols import ChecksMatches, ChecksObjects, FollowsRight, Frontend
 from vio.records import (
     FrontendOutput,
     Observations,
@@ -50,17 +51,19 @@ class GuardedFrontend:
     """Checks the images of each frame before a front end sees them, and its right matches after it;
     see `vio.protocols.Frontend`.
 
-    Images that no front end takes are handed on as they are. A front end that checks its matches
-    itself (`vio.protocols.ChecksMatches`) is not checked again.
+    Images that no front end takes are handed on as they are. The features of a front end that checks
+    them itself (`vio.protocols.ChecksMatches`, `ChecksObjects`) are not checked again.
     """
 
     def __init__(self, frontend: Frontend, camera: StereoCamera) -> None:
         self.frontend = frontend
         self._pair = camera.kind == "stereo"
-        # the front end, where it may check its matches itself; slow to ask in every frame
+        # the front end, where it may check matches and objects itself; slow to ask in every frame
         self._may_check = frontend if isinstance(frontend, ChecksMatches) else None
+        self._may_check_objects = frontend if isinstance(frontend, ChecksObjects) else None
         self._checks = image_checks(camera)
         self._matches = RightMatches(camera)
+        self._objects = ObjectMatches(camera)
         self._swap = next((c for c in self._checks if isinstance(c, SwapDetector)), None)
         self._exchange = next((c for c in self._checks if isinstance(c, ExchangeDetector)), None)
 
@@ -73,7 +76,7 @@ class GuardedFrontend:
         images = images_of(frame, pair=self._pair)
         if images is None:
             output = self.frontend.process(frame, prior)
-            return self._checked(output, (), right_usable=True)
+            return self._checked(output, (), prior, right_usable=True)
         images = self._inspect(images)
         output = self._output(images, prior)
         if self._exchange is not None and images.right_usable:
@@ -81,15 +84,19 @@ class GuardedFrontend:
             known = self._swap is not None and self._swap.decided
             self._exchange.suspicious = known and _few_matches(output.observations)
         found = tuple(f for check in self._checks for f in check.take_findings())
-        return self._checked(output, found, right_usable=images.right_usable)
+        return self._checked(output, found, prior, right_usable=images.right_usable)
 
     def _checked(
-        self, output: FrontendOutput, found: tuple[Finding, ...], *, right_usable: bool
+        self,
+        output: FrontendOutput,
+        found: tuple[Finding, ...],
+        prior: TrackPrior | None,
+        *,
+        right_usable: bool,
     ) -> FrontendOutput:
-        """Return an output after the checks of its right matches, with findings `found` before
-        them.
+        """Return an output after the checks of its columns, with findings `found` before them.
 
-        Without a usable right image there is nothing to check.
+        Without a usable right image there is nothing of it to check.
         """
         seen = output.observations
         if not right_usable:
@@ -97,6 +104,9 @@ class GuardedFrontend:
         elif self._may_check is None or not self._may_check.checks_matches:
             seen = self._matches.inspect(seen)
             found = (*found, *self._matches.take_findings())
+        if self._may_check_objects is None or not self._may_check_objects.checks_objects:
+            seen = self._objects.inspect(seen, prior)
+            found = (*found, *self._objects.take_findings())
         return _with_findings(output, seen, found)
 
     def _inspect(self, images: FrameImages) -> FrameImages:

@@ -76,18 +76,27 @@ class RowProbe:
         return int((good & (disparity >= _RULES.min_negative_px)).sum())
 
     def on_rows(self, left: Image, right: Image, points: FloatArray) -> int:
-        """Count the pixels (N, 2) of the left image that match well on their rows."""
-        return self._well_matched(left, shifted_rows(right, self._rows), points)
+        """Count the pixels (N, 2) of the left image that match well on their rows.
+
+        Those of images of two times may have been matched best at rows that are no camera's, and
+        other pairings of the same images are not to pay for it: rows as calibrated count as well.
+        """
+        return max(
+            self._well_matched(left, shifted_rows(right, rows), points) for rows in {0, self._rows}
+        )
 
     def near_rows(self, left: Image, right: Image, points: FloatArray) -> IntArray:
         """Count (K,) the pixels (N, 2) of the left image that match well on their rows, and on rows
-        a little above and below.
+        a little above and below; see `on_rows`.
         """
-        counts = [
-            self._well_matched(left, _between_rows(right, self._rows + rows), points)
-            for rows in _NEAR_ROWS
-        ]
-        return np.array(counts, dtype=np.int64)
+        counts = {
+            rows: [
+                self._well_matched(left, _between_rows(right, rows + near), points)
+                for near in _NEAR_ROWS
+            ]
+            for rows in {0, self._rows}
+        }
+        return np.array(counts[0] + counts[self._rows], dtype=np.int64)
 
     def _well_matched(self, left: Image, right: Image, points: FloatArray) -> int:
         reach = _RULES.usual_disparity * 2 * left.shape[1]

@@ -20,6 +20,10 @@ from vio.records import NS_PER_S, Estimate
 
 _HOLDS_NS = NS_PER_S  # an event without an end is one of the second after it
 _MIN_SPEED_MPS = 0.1  # of a rig that stands still as far as the estimate says
+# Levels of what the scale may be off by, over it: the first one, and from one to the next. Where
+# one is reached, earlier frames below it are brought to it.
+_MIN_SCALE_DOUBT = 0.005
+_SCALE_DOUBT_GROWS = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +33,8 @@ class Mark:
     since: int  # first frame
     before: int  # frame after the last one
     integrity: Integrity
-    code: str
+    code: str | None  # of the finding; None: there is none, the covariance alone changes
+    scale: float = 0.0  # standard deviation of distances from the first pose, over them
 
 
 @dataclass(slots=True)
@@ -53,6 +58,9 @@ class IntegrityMonitor:
         self._unusable_since_ns: int | None = None
         self._carried_m = 0.0  # that the position may be off by since earlier faults
         self._doubt_m = 0.0  # the same with the present one
+        # frames and the level of the scale's doubt that their covariances have from there on: less
+        # in each than in the one before
+        self._scale_doubts: list[tuple[int, int]] = []
 
     def take(self, finding: Finding) -> None:
         """Take a finding; it counts from the next estimate on."""
@@ -66,6 +74,23 @@ class IntegrityMonitor:
             entry = self._holding.get(code)
             if entry is not None and self._onset_ns(entry.finding, good_ns + 1) > good_ns:
                 del self._holding[code]
+
+    def take_scale_doubt(self, index: int, doubt: float) -> None:
+        """Take by what the scale may be off, over it, as a frame has shown; it was off in the
+        frames before as well.
+        """
+        level = 0
+        if doubt >= _MIN_SCALE_DOUBT:
+            level = 1 + int(np.log(doubt / _MIN_SCALE_DOUBT) / np.log(_SCALE_DOUBT_GROWS))
+        since = index
+        while self._scale_doubts and self._scale_doubts[-1][1] <= level:
+            before = since
+            since, known = self._scale_doubts.pop()
+            if known < level:
+                variance = _scale_doubt(level) ** 2 - _scale_doubt(known) ** 2
+                scale = float(np.sqrt(variance))
+                self._marks.append(Mark(since, before, "nominal", None, scale))
+        self._scale_doubts.append((since, level))
 
     def take_marks(self) -> tuple[Mark, ...]:
         """Return the marks of earlier frames since the last call."""
@@ -145,6 +170,11 @@ class IntegrityMonitor:
         self._speed_mps = max(self._speed_mps, step_m * NS_PER_S / (estimate.time_ns - last[0]))
 
 
+def _scale_doubt(level: int) -> float:
+    """The doubt of the scale at which a level begins; 0 for none."""
+    return 0.0 if level == 0 else _MIN_SCALE_DOUBT * _SCALE_DOUBT_GROWS ** (level - 1)
+
+
 def inflated(covariance: FloatArray, sigma_m: float) -> FloatArray:
     """Return a covariance (6, 6) of a pose, with a standard deviation of its position added on
     each axis.
@@ -157,8 +187,10 @@ def inflated(covariance: FloatArray, sigma_m: float) -> FloatArray:
 def marked(estimate: Estimate, mark: Mark, sigma_m: float) -> Estimate:
     """Return an earlier estimate with a mark; `sigma_m` is what its position may be off by more."""
     integrity = max(estimate.integrity, mark.integrity, key=INTEGRITIES.index)
-    codes = tuple(sorted({*estimate.findings, mark.code}))
+    codes = estimate.findings
+    if mark.code is not None:
+        codes = tuple(sorted({*codes, mark.code}))
     covariance = estimate.covariance
-    if mark.integrity == "unusable":
+    if mark.integrity == "unusable" or mark.scale > 0.0:
         covariance = inflated(covariance, sigma_m)
     return replace(estimate, integrity=integrity, findings=codes, covariance=covariance)

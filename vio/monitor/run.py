@@ -289,6 +289,7 @@ class RunMonitor:
             self._add(self._contradiction.frame(index, report.innovation_ratio))
         if report.gyro_jump_radps is not None and self._inertial is not None:
             self._inertial.begin_after_jump()
+        self._integrity.take_scale_doubt(index, report.scale_doubt)
         if self._seen is not None:
             self._add(self._refusals.frame(self._seen, report, estimate))
         self._scale_lines += self._health.scale(index, estimate)

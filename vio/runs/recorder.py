@@ -31,6 +31,7 @@ from vio.protocols import Dataset
 from vio.records import (
     NS_PER_S,
     BodyFrame,
+    BoolArray,
     Estimate,
     FrameLog,
     FrameResult,
@@ -209,10 +210,9 @@ class RunRecorder:
             for mark in marks:
                 rows = np.array(estimates.rows())
                 held = (rows["index"] >= mark.since) & (rows["index"] < mark.before)
-                speed = _fastest_mps(rows)
+                sigma_m = _may_be_off_m(rows, held, mark)
                 for k in np.flatnonzero(held).tolist():
-                    elapsed_s = (rows["time_ns"][k] - rows["time_ns"][held][0]) / NS_PER_S
-                    estimate = marked(estimate_of(rows[k]), mark, speed * elapsed_s)
+                    estimate = marked(estimate_of(rows[k]), mark, sigma_m[k])
                     estimates.replace(k, estimate_row(int(rows["index"][k]), estimate))
                     log_row = np.array(frames.rows(k, k + 1))
                     log_row["integrity"] = INTEGRITIES.index(estimate.integrity)
@@ -447,6 +447,17 @@ class RunRecorder:
                 stream.write(text.encode())
                 stream.flush()
                 os.fsync(stream.fileno())
+
+
+def _may_be_off_m(rows: Rows, held: BoolArray, mark: Mark) -> FloatArray:
+    """What the positions of estimates (N,) may be off by more, as a mark of some of them (N,) says."""
+    if not held.any():
+        return np.zeros(len(rows))
+    if mark.scale > 0.0:
+        position = rows["T_world_imu"][:, :3, 3]
+        return np.asarray(mark.scale * np.linalg.norm(position - position[0], axis=1))
+    elapsed_s = (rows["time_ns"] - rows["time_ns"][held][0]) / NS_PER_S
+    return np.asarray(_fastest_mps(rows) * elapsed_s)
 
 
 def _fastest_mps(rows: Rows) -> float:

@@ -1,0 +1,171 @@
+"""What is said of objects that cover much of the image, and whether they hide the scene."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+from vio.findings import Finder, Finding
+from vio.frontend.columns import share_of
+from vio.frontend.expected_motion import AGREEMENT_LIMIT, ExpectedMotion
+from vio.frontend.moving_object import CLEARLY_NEARER, MIN_POINTS, TwoMotions
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.records import BoolArray, MotionPrior
+
+_FRAMES = 5  # in a row before an object is reported …
+# … or so many of the last ones, where a decision was made: a slow one is seen in some of them only
+_RECENT_FRAMES = 15
+_EVENT_FRAMES = 2  # in a row before an object is known, and may hide the scene
+# of the points that the scene has, during an event, below which the object hides it …
+_HIDDEN_SHARE = 0.1
+_HIDDEN_FRAMES = 3  # … in so many frames in a row
+_CLEAR_FRAMES = 20  # without one before the next is another event
+
+
+class ObjectReport(Finder):
+    """Reports once per event that an object covers much of the image, and what decided which
+    motion is the camera's.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        # squared distances from the prediction of motions that older points support
+        self._usual = deque[float](maxlen=_CLEAR_FRAMES)
+        self._frames = 0  # with an object, in a row
+        self._since = 0  # the first of them
+        self._decided = deque[int]()  # recent frames in which it was told from the scene
+        self._clear = 0  # without one, in a row
+        self._hidden = 0  # that an object hides, in a row
+        self._reported: str | None = None  # code of the event that goes on
+        self._hidden_reported = False
+        self._active = False
+
+    @property
+    def active(self) -> bool:
+        """Whether the prediction has distinguished an object from the scene in some of the last
+        frames.
+        """
+        return self._active
+
+    def questioned(
+        self,
+        motions: TwoMotions,
+        camera: StereoCamera,
+        p_prev: FloatArray,
+        predicted: MotionPrior,
+        voting: BoolArray,
+        disparity_error_px: float,
+    ) -> TwoMotions:
+        """Return the motions of a frame, as unsupported ones where the camera's is far off an
+        extrapolated prediction, and no older point supports it.
+
+        Arguments as of `choose_motion`; the camera's motion is the only one.
+        """
+        motion = motions.motion
+        expected = ExpectedMotion(camera, predicted, disparity_error_px)
+        supported = int((motion.inliers & voting).sum()) >= MIN_POINTS
+        limit = (
+            AGREEMENT_LIMIT if supported else CLEARLY_NEARER * max([AGREEMENT_LIMIT, *self._usual])
+        )
+        distance = 0.0
+        if expected.is_beyond(motion.T_curr_prev, limit):
+            distance = expected.distance(motion.T_curr_prev, p_prev[motion.inliers])
+        if supported:
+            self._usual.append(distance)
+        if supported or not self._usual or distance <= limit:
+            return motions
+        return replace(motions, object_share=share_of(motion.inliers), decision="unsupported")
+
+    def hides_scene(self, index: int, motions: TwoMotions) -> bool:
+        """Return whether a known object has left too few points of the scene for some frames, so
+        that none is used.
+        """
+        hidden = self._active and float(motions.motion.inliers.mean()) < _HIDDEN_SHARE
+        self._hidden = self._hidden + 1 if hidden else 0
+        if self._hidden >= _HIDDEN_FRAMES and not self._hidden_reported:
+            self._hidden_reported = True
+            message = (
+                f"frame {index}: fewer than {100 * _HIDDEN_SHARE:.0f} % of the points are left of "
+                "the scene: the object hides it, and no feature is used"
+            )
+            self._found.append(Finding("object-hides-scene", message, index, lasts=True))
+        return self._hidden >= _HIDDEN_FRAMES
+
+    def frame(self, index: int, motions: TwoMotions) -> None:
+        """Take the motions of a frame."""
+        if motions.object_share == 0.0:
+            self._no_object(index)
+            return
+        if self._frames == 0:
+            self._since = index
+        self._frames = self._frames + 1
+        self._clear = 0
+        if motions.decision == "unsupported":
+            self._report_unsupported(index, motions)
+            return
+        undecided = motions.decision == "undecided"
+        self._active = self._active or (self._frames >= _EVENT_FRAMES and not undecided)
+        if not undecided:
+            self._decided.append(index)
+        while self._decided and self._decided[0] <= index - _RECENT_FRAMES:
+            self._decided.popleft()
+        often = not undecided and len(self._decided) >= _FRAMES
+        if often:
+            self._since = min(self._since, self._decided[0])
+        if (often or self._frames >= _FRAMES) and self._reported is None:
+            self._report(index, motions)
+
+    def _no_object(self, index: int) -> None:
+        self._frames = 0
+        self._clear = self._clear + 1
+        self._active = self._active and self._clear < _FRAMES
+        if self._reported is None or self._clear < _CLEAR_FRAMES:
+            return
+        message = f"frame {index}: no object covers much of the image any more"
+        self._found.append(Finding(self._reported, message, index, ended=True))
+        if self._hidden_reported:
+            self._found.append(Finding("object-hides-scene", message, index, ended=True))
+        self._reported = None
+        self._hidden_reported = False
+
+    def _report_unsupported(self, index: int, motions: TwoMotions) -> None:
+        if self._reported == "object-or-scene":
+            return
+        if self._reported is not None:
+            self._found.append(
+                Finding(self._reported, f"frame {index}: see below", index, ended=True)
+            )
+        self._reported = "object-or-scene"
+        share = round(100 * motions.object_share)
+        message = (
+            f"frame {index}: {share} % of the points move as the rig did not before, and hardly "
+            "one of them was seen before: the rig was pushed, or an object hides the scene; they "
+            "are taken for the scene"
+        )
+        figures = {"object_share": motions.object_share}
+        self._found.append(
+            Finding("object-or-scene", message, index, index, lasts=True, figures=figures)
+        )
+
+    def _report(self, index: int, motions: TwoMotions) -> None:
+        share = round(100 * motions.object_share)
+        self._reported = "object-covers-image"
+        by = "the points seen before" if motions.decision == "voted" else "its predicted motion"
+        message = (
+            f"frame {index}: {share} % of the points move together, but not as the camera does by "
+            f"{by}: an object that moves on its own covers much of the image; its points are left "
+            "out"
+        )
+        if motions.decision == "undecided":
+            self._reported = "object-or-scene"
+            rest = round(100 * float(motions.motion.inliers.mean()))
+            message = (
+                f"frame {index}: two groups of points move differently, {rest} % and {share} % of "
+                "all: an object that moves on its own covers much of the image, and the predicted "
+                "motion does not tell which group it is; the larger one is taken for the scene"
+            )
+        figures = {"object_share": motions.object_share}
+        self._found.append(
+            Finding(self._reported, message, index, self._since, lasts=True, figures=figures)
+        )
