@@ -7,7 +7,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, z_D_p_cam
-from vio.numerics.statistics import chi_square_quantile
+from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import MotionPrior
 
 AGREEMENT_PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test

@@ -27,7 +27,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from tools.consistency import CAMERA, SAMPLES, T_CAM0_IMU, Flight, Scenario
+from tools.consistency import CAMERA, IMU, SAMPLES, T_CAM0_IMU, Flight, Scenario
 from vio.errors import VioError
 from vio.evaluation.consistency import nees, nees_bounds
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
@@ -132,11 +132,11 @@ def _fly(rig: Rig, start: Start, seed: int, scenario: Scenario) -> list[dict[str
     settings = settings_of(rig, pixel_sigma_px)
     noise = np.random.default_rng(seed)
     off = drawn(rig, settings, np.random.default_rng(10_000 + seed))
-    filt = Msckf(CAMERA, T_CAM0_IMU @ se3_inverse(se3_exp(off.xi)), settings, motion="imu")
+    filt = Msckf(CAMERA, T_CAM0_IMU @ se3_inverse(se3_exp(off.xi)), settings, motion="imu", imu=IMU)
     R, p, _ = flight.state(np.arange(scenario.frames, dtype=np.float64) * 1e-9 * _FRAME_NS)
     T = se3_from_parts(R, p)
     numbers = range(-SAMPLES * _BEFORE, SAMPLES * (scenario.frames + _AFTER))
-    samples, _ = flight.imu(numbers, noise, settings, clock_s=off.offset_s)
+    samples, _ = flight.imu(numbers, noise, IMU, clock_s=off.offset_s)
     terms = walked_terms(off, len(samples), settings, np.random.default_rng(20_000 + seed))
     samples = [_misread(sample, own) for sample, own in zip(samples, terms, strict=True)]
     fed_ns = -1_000_000_000

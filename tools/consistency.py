@@ -52,6 +52,7 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project
+from vio.imu.settings import ImuSettings
 from vio.numerics.threads import one_blas_thread
 from vio.records import (
     BoolArray,
@@ -73,6 +74,7 @@ CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(
     np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1])
 )
+IMU = ImuSettings(gyro_bias_sigma_radps=0.02, accel_bias_sigma_mps2=0.05)
 _FRAME_NS = 50_000_000
 _IMU_NS = 5_000_000
 SAMPLES = _FRAME_NS // _IMU_NS  # of the IMU in a frame
@@ -119,7 +121,7 @@ class UncertainStart(Msckf):
         start: Start,
         learn_noise: bool,
     ) -> None:
-        super().__init__(CAMERA, T_CAM0_IMU, settings, motion=motion)
+        super().__init__(CAMERA, T_CAM0_IMU, settings, motion=motion, imu=IMU)
         self._start = _START[start]
         self._begun = False
         self._learn_noise = learn_noise
@@ -182,8 +184,6 @@ class Scenario:
         s = MsckfSettings(
             max_landmarks=self.landmarks,
             pixel_sigma_px=self.pixel_sigma_px,
-            gyro_bias_sigma_radps=0.02,
-            accel_bias_sigma_mps2=0.05,
             calibrate_camera_imu="none",  # the other variants know the errors of the motion alone
             calibrate_stereo="off",
             stereo_baseline_sigma=0.0,
@@ -250,7 +250,7 @@ class Flight:
         self,
         samples: range,
         noise: np.random.Generator,
-        s: MsckfSettings,
+        s: ImuSettings,
         offset_s: float = 0.0,
         clock_s: float = 0.0,
     ) -> tuple[list[ImuSample], FloatArray]:
@@ -360,7 +360,7 @@ def _fly(job: Job, learn: bool) -> Record:
     bias: FloatArray = np.zeros((scenario.frames, 6))
     if job.motion == "imu":
         imu, walked = flight.imu(
-            range(SAMPLES * scenario.frames + 1), noise, settings, scenario.imu_offset_s
+            range(SAMPLES * scenario.frames + 1), noise, IMU, scenario.imu_offset_s
         )
         samples = list(imu)
         bias = walked[::SAMPLES][: scenario.frames]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import logging
 import math
 import types
 import typing
@@ -27,8 +28,11 @@ from vio.files.yaml_text import MAX_BYTES, read_yaml
 from vio.filters import BACKENDS
 from vio.filters.settings import MsckfSettings, VislamSettings
 from vio.frontend.settings import FrontendSettings
+from vio.imu.settings import ImuSettings
 from vio.selection.selectors import SelectorSettings
 from vio.setting import Range, Section, setting
+
+log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     BackendName = str
@@ -39,12 +43,16 @@ MotionName = Literal["auto", "imu", "velocity", "none"]
 BASIC = (
     "motion", "backend", "lag_frames", "frontend.name", "frontend.features", "frontend.grid.target_features",
     "frontend.disparity.max_disparity", "frontend.klt.mask", "frontend.klt.equalise", "selector.name",
-    "selector.budget", "msckf.clones", "msckf.max_landmarks", "msckf.gravity_mps2", "msckf.gyro_noise_density",
-    "msckf.accel_noise_density", "msckf.gyro_bias_walk", "msckf.accel_bias_walk", "msckf.calibrate_camera_imu",
+    "selector.budget", "msckf.clones", "msckf.max_landmarks", "imu.gravity_mps2", "imu.gyro_noise_density",
+    "imu.accel_noise_density", "imu.gyro_bias_walk", "imu.accel_bias_walk", "msckf.calibrate_camera_imu",
     "msckf.calibrate_stereo",
 )  # fmt: skip
-# Former settings, for the message on an unknown one: renamed, and constants of the code today.
-_RENAMED = {"msckf.calibrate": "msckf.calibrate_camera_imu"}
+# Former settings: renamed, whose values are still taken, and constants of the code today, for the
+# message on an unknown one.
+_RENAMED = {
+    "msckf.calibrate": ("msckf.calibrate_camera_imu", "0.3"),
+    **{f"msckf.{f.name}": (f"imu.{f.name}", "0.4") for f in fields(ImuSettings)},
+}
 _FIXED = {
     "frontend.grid": "cell_features min_distance",
     "frontend.disparity": "min_disparity_px",
@@ -101,6 +109,7 @@ class Config(Section):
         at_most=100,
     )
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
+    imu: ImuSettings = field(default_factory=ImuSettings)
     frontend: FrontendSettings = field(default_factory=FrontendSettings)
     selector: SelectorSettings = field(default_factory=SelectorSettings)
     vislam: VislamSettings = field(default_factory=VislamSettings)
@@ -176,6 +185,8 @@ def merge(
     """
     hints = get_type_hints(type(section))
     root = section if root is None else root
+    if isinstance(section, Config):
+        values = _with_new_names(values, where)
     names = [f.name for f in fields(section)]  # type: ignore[arg-type]
     changes: dict[str, Any] = {}
     for key, value in values.items():
@@ -199,6 +210,30 @@ def merge(
         return dataclasses.replace(section, **changes)  # type: ignore[type-var]
     except ConfigError as error:  # a value out of range
         raise ConfigError(f"{where}: {error}") from error
+
+
+def _with_new_names(values: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+    """Return the values of a whole configuration with renamed settings under their new names.
+
+    Raises:
+        ConfigError: a setting is given by both names.
+    """
+    out = dict(values)
+    for old, (new, version) in _RENAMED.items():
+        old_section, _, old_name = old.partition(".")
+        new_section, _, new_name = new.partition(".")
+        given = out.get(old_section)
+        if not isinstance(given, Mapping) or old_name not in given:
+            continue
+        message = f"{where}: '{old}' is '{new}' since {version}"
+        taken = out.get(new_section, {})
+        if isinstance(taken, Mapping) and new_name in taken:
+            raise ConfigError(f"{message}, and both are given; remove the first")
+        log.warning("%s; rename it", message)
+        out[old_section] = {name: value for name, value in given.items() if name != old_name}
+        if isinstance(taken, Mapping):
+            out[new_section] = {**out.get(new_section, {}), new_name: given[old_name]}
+    return out
 
 
 def as_dict(section: Any) -> dict[str, Any]:
@@ -330,8 +365,6 @@ def _number_hint(value: Any, hint: Any) -> str:
 
 def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
     """Suggest what to write for an unknown setting."""
-    if prefix + key in _RENAMED:
-        return f"; it is '{_RENAMED[prefix + key]}' since 0.3"
     if key in _FIXED.get(prefix[:-1], "").split():
         return "; it is fixed since 0.3: remove it"
     near = _nearest_setting(key, names, prefix, root)

@@ -10,6 +10,7 @@ from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
+from vio.imu.settings import ImuSettings
 from vio.records import (
     CheckedFrame,
     Estimate,
@@ -179,15 +180,17 @@ class Backend(Protocol):
         T_cam0_body: FloatArray,
         settings: Any,
         motion: MotionSource | None,
+        imu: ImuSettings,
     ) -> Backend:
         """Build the back end of a run; without an implementation, by the constructor with these
-        arguments.
+        arguments but the last.
 
         Args:
             camera: the rectified camera or pair.
             T_cam0_body: (4, 4) extrinsics of the body that is estimated.
             settings: the configuration's section of the back end's name; None: it has none.
             motion: which motion samples will come; None: images alone.
+            imu: the section `imu` of the configuration.
 
         Raises:
             ConfigError: it cannot estimate from this camera or motion with these settings.

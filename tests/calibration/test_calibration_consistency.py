@@ -23,9 +23,10 @@ from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import FIELD_TERMS
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse
 from vio.geometry.stereo import project
+from vio.imu.settings import ImuSettings
 from vio.records import Estimate, StereoFieldEstimate, StereoScaleEstimate, observations
 
-QUIET = MsckfSettings(
+QUIET = ImuSettings(
     gyro_noise_density=1e-9, accel_noise_density=1e-9, gyro_bias_sigma_radps=0, accel_bias_sigma_mps2=0,
     gyro_bias_walk=0, accel_bias_walk=0,
 )  # fmt: skip
@@ -36,7 +37,7 @@ def test_a_flight_and_its_imu_agree(flight: Flight) -> None:
     """Integrating the exact rates gives the exact states: what the Monte-Carlo calls the truth
     is one.
     """
-    motion = ImuMotion(QUIET)
+    motion = ImuMotion(MsckfSettings(), QUIET)
     samples, bias = flight.imu(range(401), np.random.default_rng(0), QUIET)
     assert not bias.any()
     for sample in samples:

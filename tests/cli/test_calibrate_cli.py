@@ -21,7 +21,6 @@ from tests.filters.test_online_calibration import Shaking, _samples
 from vio.cli import main
 from vio.datasets.observation_log import write_observation_log
 from vio.evaluation.errors_along_path import rotation_angle_deg
-from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.records import Recording
 
@@ -45,9 +44,7 @@ def _flight(path: Path, T_cam0_imu: FloatArray, offset_s: float) -> Path:
     """Write tracks and IMU samples of a shaking flight with a clock offset and given extrinsics."""
     flight, rng, end_ns = Shaking(FRAMES), np.random.default_rng(0), (FRAMES - 1) * STEP_NS
     seen = [flight.observe(k, 0.3, rng, 80) for k in range(FRAMES)]
-    samples = [
-        s for s in _samples(flight, MsckfSettings(), offset_s, rng) if 0 <= s.time_ns <= end_ns
-    ]
+    samples = [s for s in _samples(flight, offset_s, rng) if 0 <= s.time_ns <= end_ns]
     times = np.arange(FRAMES) * STEP_NS
     write_observation_log(
         path,

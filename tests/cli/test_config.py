@@ -81,10 +81,6 @@ def test_empty_file_changes_nothing(tmp_path: Path) -> None:
             "frontend:\n  klt:\n    window_px: 21\n",
             r"'frontend\.klt\.window_px'; it is fixed since 0\.3",
         ),
-        (
-            "msckf:\n  calibrate: both\n",
-            r"'msckf\.calibrate'; it is 'msckf\.calibrate_camera_imu' since 0\.3",
-        ),
         ("target_features: 300\n", r"did you mean 'frontend\.grid\.target_features'"),
         ("vislam: 3\n", r"'vislam' is a section"),
         ("vislam:\n  iterations: 2.5\n", r"vislam\.iterations takes a whole number, got 2\.5"),
@@ -183,14 +179,49 @@ def test_every_number_has_a_range_and_other_values_are_rejected(info: SettingInf
 
 
 def test_rejects_infinite_numbers_and_checks_ranges_in_code() -> None:
-    with pytest.raises(ConfigError, match=r"msckf\.gravity_mps2 must be finite"):
-        load_config(None, ["msckf.gravity_mps2=.inf"])
+    with pytest.raises(ConfigError, match=r"imu\.gravity_mps2 must be finite"):
+        load_config(None, ["imu.gravity_mps2=.inf"])
     with pytest.raises(
         ConfigError, match=r"msckf\.clones must be at least 3 and at most 100, got 2"
     ):
         MsckfSettings(clones=2)
     with pytest.raises(ConfigError, match=r"msckf\.pixel_sigma_max_px must be above 0, got -3"):
         MsckfSettings(pixel_sigma_max_px=-3.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "value"),
+    [
+        ("msckf.calibrate", "msckf.calibrate_camera_imu", "both"),
+        ("msckf.gravity_mps2", "imu.gravity_mps2", 9.79),
+        ("msckf.gyro_noise_density", "imu.gyro_noise_density", 1e-3),
+        ("msckf.accel_bias_sigma_mps2", "imu.accel_bias_sigma_mps2", 0.5),
+    ],
+)
+def test_takes_a_setting_by_its_former_name_and_says_the_new_one(
+    old: str, new: str, value: object, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    section, _, name = old.partition(".")
+    path = tmp_path / "old.yaml"
+    path.write_text(f"{section}:\n  clones: 9\n  {name}: {value}\n")
+    expected = load_config(None, [f"{new}={value}", "msckf.clones=9"])
+    assert load_config(path) == load_config(None, [f"{old}={value}", "msckf.clones=9"]) == expected
+    assert [record.getMessage().partition(": ")[2][:-10] for record in caplog.records] == [
+        f"'{old}' is '{new}' since {'0.3' if 'calibrate' in old else '0.4'}"
+    ] * 2
+
+
+def test_refuses_a_setting_by_both_of_its_names(tmp_path: Path) -> None:
+    path = tmp_path / "both.yaml"
+    path.write_text("msckf:\n  gravity_mps2: 9.79\nimu:\n  gravity_mps2: 9.8\n")
+    with pytest.raises(ConfigError, match=r"'imu\.gravity_mps2' since 0\.4, and both are given"):
+        load_config(path)
+    path.write_text("msckf:\n  gravity_mps2: 9.79\nimu: 3\n")
+    with pytest.raises(ConfigError, match="'imu' is a section"):
+        load_config(path)
+    path.write_text("msckf:\n  gravity_mps2: heavy\n")
+    with pytest.raises(ConfigError, match=r"imu\.gravity_mps2 takes a number"):
+        load_config(path)
 
 
 def test_preset_is_found_by_its_name_and_is_packaged(

@@ -31,6 +31,7 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project
+from vio.imu.settings import DEFAULT_IMU
 from vio.records import (
     BoolArray,
     Estimate,
@@ -108,17 +109,17 @@ class Course:
             k, k * 10**9 // self.hz, ids, z[ids] + rng.normal(0, self.pixel_sigma_px, (len(ids), 4))
         )
 
-    def imu(self, k: int, settings: MsckfSettings, rng: np.random.Generator) -> ImuSample:
+    def imu(self, k: int, rng: np.random.Generator) -> ImuSample:
         """IMU sample k, with white noise and constant biases."""
         R, root = self.pose(k / _IMU_HZ)[:3, :3], np.sqrt(_IMU_HZ)
         gyro = (
             np.array([0, 0, self.yaw_rate])
-            + rng.normal(0, settings.gyro_noise_density * root, 3)
+            + rng.normal(0, DEFAULT_IMU.gyro_noise_density * root, 3)
             + self.bias[:3]
         )
         accel = (
             R.T @ [0, 0, 9.81]
-            + rng.normal(0, settings.accel_noise_density * root, 3)
+            + rng.normal(0, DEFAULT_IMU.accel_noise_density * root, 3)
             + self.bias[3:]
         )
         return ImuSample(k * 10**9 // _IMU_HZ, gyro, accel)
@@ -169,7 +170,7 @@ def fly(
     world = TrueWorld(run.filter, upright=motion == "imu")
     for k in range(course.frames):
         while motion == "imu" and fed * course.hz <= (k + 1) * _IMU_HZ:
-            run.filter.propagate(course.imu(fed, settings, rng_imu))
+            run.filter.propagate(course.imu(fed, rng_imu))
             fed += 1
         seen = course.observe(k, rng)
         run.reports.append(run.filter.update(seen if spoil is None else spoil(k, seen)))
@@ -479,7 +480,7 @@ def test_smoothed_estimates_carry_their_own_covariance_and_velocity(
     # the filter starts with five times the IMU's noise by its data sheet
     assert mean.mean() > 0.6 * low
     causal, late = (float(np.mean(np.square(e))) for e in (causal_mps, smoothed_mps))
-    extra = settings.accel_noise_density**2 * lag / course.hz if motion == "imu" else 0.0
+    extra = DEFAULT_IMU.accel_noise_density**2 * lag / course.hz if motion == "imu" else 0.0
     assert late < causal + extra
     if motion is None:
         assert late < 0.5 * causal

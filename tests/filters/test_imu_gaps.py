@@ -22,6 +22,7 @@ from vio.filters.msckf import Msckf
 from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log
+from vio.imu.settings import DEFAULT_IMU, ImuSettings
 from vio.live.processor import Due, EventOrder
 from vio.monitor.run import RunMonitor
 from vio.records import Event, ImuSample, StereoFrame, UpdateReport, VelocitySample
@@ -152,9 +153,9 @@ def _step_errors() -> dict[tuple[float, bool], list[float]]:
             if k == last + 1:
                 _step(motion, last, False, out)
             R, _, _, a, omega = _brisk(k / rate)
-            gyro = omega + rng.normal(0, QUIET.gyro_noise_density * np.sqrt(rate), 3)
+            gyro = omega + rng.normal(0, DEFAULT_IMU.gyro_noise_density * np.sqrt(rate), 3)
             accel = R.T @ (a + np.array([0, 0, 9.81])) + rng.normal(
-                0, QUIET.accel_noise_density * np.sqrt(rate), 3
+                0, DEFAULT_IMU.accel_noise_density * np.sqrt(rate), 3
             )
             motion.take(ImuSample(k * 10_000_000, gyro, accel))
         _step(motion, last, True, out)
@@ -199,10 +200,8 @@ def _without(first_s: float, length_s: float) -> type[Flight]:
     """A flight whose IMU is silent for a while."""
 
     class Gappy(Flight):
-        def imu(
-            self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
-        ) -> list[ImuSample]:
-            samples = super().imu(noise, settings, bias)
+        def imu(self, noise: np.random.Generator, bias: FloatArray) -> list[ImuSample]:
+            samples = super().imu(noise, bias)
             return [x for x in samples if not first_s < x.time_ns * 1e-9 < first_s + length_s]
 
     return Gappy
@@ -244,7 +243,9 @@ def test_a_clean_imu_is_integrated_as_ever() -> None:
     zero = np.zeros(3)
     step = motion.advance(NavState(np.eye(4), zero, zero, zero, zero), 100_000_000, 150_000_000)
     assert not step.bridged
-    np.testing.assert_allclose(np.diag(step.Q)[3:6], QUIET.gyro_noise_density**2 * 0.05, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.diag(step.Q)[3:6], DEFAULT_IMU.gyro_noise_density**2 * 0.05, rtol=1e-9
+    )
 
 
 def test_a_gap_hides_what_a_brownian_bridge_hides_and_a_hold_what_brownian_motion_does() -> None:
@@ -252,11 +253,11 @@ def test_a_gap_hides_what_a_brownian_bridge_hides_and_a_hold_what_brownian_motio
     after the last.
     """
     rng, q, T = np.random.default_rng(1), 4.0, 0.08
-    settings = replace(QUIET, gyro_noise_density=1e-9, accel_noise_density=1e-9)
+    imu = ImuSettings(gyro_noise_density=1e-9, accel_noise_density=1e-9)
     zero = np.zeros(3)
     ratios = []
     for _ in range(30):
-        motion = ImuMotion(settings)
+        motion = ImuMotion(QUIET, imu)
         walk = np.cumsum(rng.normal(0, np.sqrt(q * 0.005), (400, 3)), axis=0)
         for k in [*range(384), 399]:
             motion.take(ImuSample(5_000_000 * k, zero, walk[k]))
@@ -357,7 +358,7 @@ def test_frames_wait_for_an_imu_that_begins_late() -> None:
     reports = [filt.update(flight.observe(k, 0.5, rng)) for k in range(60)]
     assert reports == [UpdateReport(0, 0, 0, 0, None, None)] * 60
     assert filt.estimate().time_ns == 59 * STEP_NS
-    for sample in flight.imu(rng, settings, np.zeros(6)):
+    for sample in flight.imu(rng, np.zeros(6)):
         if 59 * STEP_NS < sample.time_ns <= 60 * STEP_NS:
             filt.propagate(sample)
     filt.update(flight.observe(60, 0.5, rng))
@@ -376,7 +377,7 @@ def test_a_prediction_over_seconds_is_made_by_an_imu_alone(
     _, _, filt = flight.run(MsckfSettings(), motion, limit=30)
     assert filt.predict(8 * STEP_NS) is not None
     if motion == "imu":
-        for sample in Flight(80).imu(np.random.default_rng(1), MsckfSettings(), np.zeros(6)):
+        for sample in Flight(80).imu(np.random.default_rng(1), np.zeros(6)):
             if sample.time_ns > 7 * STEP_NS:
                 filt.propagate(sample)
     assert (filt.predict(7 * STEP_NS + 3_000_000_000) is not None) is useful

@@ -12,7 +12,6 @@ import pytest
 from tests.filters.test_msckf import EXACT_RIG, STEP_NS, Flight
 from vio.filters.imu_jump import GyroJump, turn_of_images
 from vio.filters.msckf import Msckf
-from vio.filters.settings import MsckfSettings
 from vio.filters.track_records import Residuals
 from vio.filters.window_tracks import LinearTracks
 from vio.geometry.lie import FloatArray, so3_exp
@@ -40,15 +39,13 @@ class _Shaken(Flight):
         self.bias = bias
         self.last = last
 
-    def imu(
-        self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
-    ) -> list[ImuSample]:
+    def imu(self, noise: np.random.Generator, bias: FloatArray) -> list[ImuSample]:
         # the jump is within a frame's interval
         first_ns = round((JUMP_FRAME - 0.4) * STEP_NS)
         last_ns = round((self.last - 0.4) * STEP_NS)
         return [
             replace(x, gyro=x.gyro + self.bias) if first_ns <= x.time_ns < last_ns else x
-            for x in super().imu(noise, settings, bias)
+            for x in super().imu(noise, bias)
         ]
 
 
@@ -90,11 +87,9 @@ def test_steps_that_were_off_before_make_no_jump() -> None:
 class _Turned(Flight):
     """A flight whose gyro is turned by 15 degrees about the camera's axis."""
 
-    def imu(
-        self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
-    ) -> list[ImuSample]:
+    def imu(self, noise: np.random.Generator, bias: FloatArray) -> list[ImuSample]:
         R = so3_exp([0.0, 0.0, np.radians(15.0)])
-        return [replace(x, gyro=R @ x.gyro) for x in super().imu(noise, settings, bias)]
+        return [replace(x, gyro=R @ x.gyro) for x in super().imu(noise, bias)]
 
 
 def test_a_gyro_that_is_turned_has_not_jumped() -> None:

@@ -15,6 +15,7 @@ from vio.filters.imu_start import imu_start
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, so3_exp
+from vio.imu.settings import DEFAULT_IMU
 from vio.records import ImuSample
 
 SETTINGS = MsckfSettings()
@@ -59,17 +60,17 @@ class Start(Flight):
             self.turn,
         )
 
-    def imu(
-        self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
-    ) -> list[ImuSample]:
+    def imu(self, noise: np.random.Generator, bias: FloatArray) -> list[ImuSample]:
         out = []
         for k in range(-round(RATE), FRAMES * 10):
             R, _, _, a, omega = self.state(k / RATE)
             gyro = (
-                omega + bias[:3] + noise.normal(0, settings.gyro_noise_density * np.sqrt(RATE), 3)
+                omega
+                + bias[:3]
+                + noise.normal(0, DEFAULT_IMU.gyro_noise_density * np.sqrt(RATE), 3)
             )
-            force = R.T @ (a + np.array([0, 0, settings.gravity_mps2])) + bias[3:]
-            force = force + noise.normal(0, settings.accel_noise_density * np.sqrt(RATE), 3)
+            force = R.T @ (a + np.array([0, 0, DEFAULT_IMU.gravity_mps2])) + bias[3:]
+            force = force + noise.normal(0, DEFAULT_IMU.accel_noise_density * np.sqrt(RATE), 3)
             out.append(ImuSample(k * 5_000_000, gyro, force))
         return out
 
@@ -142,7 +143,7 @@ def test_a_start_is_solved_within_a_second(name: str) -> None:
     found = _after_a_second(STARTS[name])
     assert np.median(found.tilt_deg) < 1.0, found
     assert np.sqrt(np.mean(found.tilt_deg**2)) < np.degrees(
-        SETTINGS.accel_bias_sigma_mps2 / 9.81
+        DEFAULT_IMU.accel_bias_sigma_mps2 / 9.81
     ), found
     for value, dof in ((found.pose, 6), (found.tilt, 2), (found.velocity, 3)):
         assert value < nees_bounds(dof, SEEDS)[1], found
@@ -157,12 +158,12 @@ def test_the_first_tilt_is_covered_by_its_standard_deviation(name: str, still: b
     """
     start = STARTS[name]
     bias = np.array([0.02, -0.01, 0.03, 0.05, -0.05, 0.05])
-    samples = [x for x in start.imu(np.random.default_rng(0), SETTINGS, bias) if x.time_ns <= 0]
-    found = imu_start(samples, 0, SETTINGS)
+    samples = [x for x in start.imu(np.random.default_rng(0), bias) if x.time_ns <= 0]
+    found = imu_start(samples, 0, DEFAULT_IMU)
     R = start.state(0.0)[0]
-    horizontal = np.linalg.norm(np.cross(R @ found.force, [0, 0, 1])) * SETTINGS.gravity_mps2
+    horizontal = np.linalg.norm(np.cross(R @ found.force, [0, 0, 1])) * DEFAULT_IMU.gravity_mps2
     horizontal /= np.linalg.norm(found.force)
-    assert horizontal < 3 * np.hypot(found.accel_sigma_mps2, SETTINGS.accel_bias_sigma_mps2)
+    assert horizontal < 3 * np.hypot(found.accel_sigma_mps2, DEFAULT_IMU.accel_bias_sigma_mps2)
     assert np.all(np.abs(found.gyro_bias - bias[:3]) < 3 * found.gyro_bias_sigma_radps)
     if still or name == "take-off":
         assert found.still
@@ -174,7 +175,7 @@ def test_the_first_tilt_is_covered_by_its_standard_deviation(name: str, still: b
 
 def test_vibration_is_no_standstill_and_neither_is_a_start_without_samples() -> None:
     rng = np.random.default_rng(0)
-    gravity = np.array([0, 0, SETTINGS.gravity_mps2])
+    gravity = np.array([0, 0, DEFAULT_IMU.gravity_mps2])
     swaying = [
         ImuSample(
             k * 5_000_000,
@@ -183,6 +184,6 @@ def test_vibration_is_no_standstill_and_neither_is_a_start_without_samples() -> 
         )
         for k in range(100)
     ]
-    assert not imu_start(swaying, 10**9, SETTINGS).still
-    assert not imu_start(swaying[:10], 10**9, SETTINGS).still
-    assert not imu_start(swaying[:1], 10**9, SETTINGS).still
+    assert not imu_start(swaying, 10**9, DEFAULT_IMU).still
+    assert not imu_start(swaying[:10], 10**9, DEFAULT_IMU).still
+    assert not imu_start(swaying[:1], 10**9, DEFAULT_IMU).still

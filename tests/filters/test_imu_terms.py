@@ -27,6 +27,7 @@ from vio.filters.supervised import SupervisedMsckf
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_log
 from vio.geometry.stereo import CameraKind
 from vio.geometry.upright import rotation_to_up
+from vio.imu.settings import DEFAULT_IMU
 from vio.live.build import build_backend
 from vio.live.prediction import PosePredictor
 from vio.records import Estimate, ImuSample, MotionSource, imu_matrices
@@ -187,17 +188,15 @@ class Run:
         return last.imu_terms, last.imu_terms_sigma
 
 
-def _samples(
-    flight: Flight, terms: FloatArray, settings: MsckfSettings, noise: np.random.Generator
-) -> list[ImuSample]:
+def _samples(flight: Flight, terms: FloatArray, noise: np.random.Generator) -> list[ImuSample]:
     """IMU samples at 200 Hz with biases of 0.02 rad/s and 0.05 m/s^2 of an IMU that is off by
     terms.
     """
     M_accel, M_gyro = imu_matrices(terms)
     bias = noise.normal(0, [0.02] * 3 + [0.05] * 3)
-    sigmas = np.repeat([settings.gyro_noise_density, settings.accel_noise_density], 3) * np.sqrt(
-        200.0
-    )
+    sigmas = np.repeat(
+        [DEFAULT_IMU.gyro_noise_density, DEFAULT_IMU.accel_noise_density], 3
+    ) * np.sqrt(200.0)
     out = []
     for k in range(-20, 10 * flight.frames + 20):
         R, _, _, a, omega = flight.state(k / 200)
@@ -220,9 +219,7 @@ def _fly(
 ) -> Run:
     noise = np.random.default_rng(0)
     filt = Msckf(CAMERA, T_cam0_imu, settings, motion="imu")
-    samples = [
-        replace(s, time_ns=s.time_ns + offset_ns) for s in _samples(flight, terms, settings, noise)
-    ]
+    samples = [replace(s, time_ns=s.time_ns + offset_ns) for s in _samples(flight, terms, noise)]
     estimates, errors = fly_with(filt, flight, samples, noise, sigma)
     rms = float(np.sqrt(np.mean(np.sum(errors[flight.frames // 5 :] ** 2, axis=1))))
     return Run(rms, estimates)
@@ -248,7 +245,7 @@ def test_predicted_motions_are_as_uncertain_as_the_terms() -> None:
     """
     noise, flight = np.random.default_rng(0), Shaking(20)
     filt = Msckf(CAMERA, T_CAM0_IMU, FULL, motion="imu")
-    samples, squared = _samples(flight, OFF_BY_1_PERCENT, FULL, noise), []
+    samples, squared = _samples(flight, OFF_BY_1_PERCENT, noise), []
     for k in range(20):
         while samples[0].time_ns <= (k + 1) * STEP_NS:
             filt.propagate(samples.pop(0))
@@ -281,7 +278,7 @@ def test_standstill_shows_what_gravity_tells_and_no_more() -> None:
     """
     terms, sigmas = _fly(Shaking(80, still=True), FULL, OFF_BY_1_PERCENT, sigma=0.1).terms
     prior = np.where(np.isin(np.arange(15), CHOSEN["scale"]), 0.01, np.radians(0.5))
-    prior[2] = (0.01**-2 + (FULL.accel_bias_sigma_mps2 / 9.81) ** -2) ** -0.5
+    prior[2] = (0.01**-2 + (DEFAULT_IMU.accel_bias_sigma_mps2 / 9.81) ** -2) ** -0.5
     np.testing.assert_allclose(sigmas / prior, 1.0, atol=0.01)
     terms[2] -= 0.05 / 9.81 * (1 - (prior[2] / 0.01) ** 2)  # of the bias
     assert np.abs(terms / prior).max() < 0.1
@@ -331,7 +328,7 @@ def test_a_stereo_field_that_begins_later_finds_its_place_behind_the_terms() -> 
     # begins in a frame
     filt = Msckf(CAMERA, T_CAM0_IMU, replace(FULL, calibrate_stereo="on"), motion="imu")
     flight, noise = Shaking(20), np.random.default_rng(0)
-    for sample in _samples(flight, np.zeros(15), FULL, noise)[:26]:
+    for sample in _samples(flight, np.zeros(15), noise)[:26]:
         filt.propagate(sample)
     for k in range(2):
         filt.update(flight.observe(k, 0.5, noise, 40))
@@ -393,9 +390,7 @@ def test_survives_a_late_imu_a_gap_a_checkpoint_and_a_restart(tmp_path: Path) ->
     covariance.
     """
     noise, flight = np.random.default_rng(0), Shaking(60)
-    samples = [
-        s for s in _samples(flight, OFF_BY_1_PERCENT, FULL, noise) if s.time_ns > 10 * STEP_NS
-    ]
+    samples = [s for s in _samples(flight, OFF_BY_1_PERCENT, noise) if s.time_ns > 10 * STEP_NS]
     samples = [s for s in samples if not 25 * STEP_NS < s.time_ns < 29 * STEP_NS]
     filters, dataset = (
         [SupervisedMsckf(CAMERA, T_CAM0_IMU, FULL)],

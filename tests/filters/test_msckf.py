@@ -37,6 +37,7 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project
+from vio.imu.settings import DEFAULT_IMU
 from vio.records import (
     ImuSample,
     IntArray,
@@ -505,21 +506,21 @@ class Flight:
         omega = so3_log(attitude(t - h).T @ attitude(t + h)) / (2 * h)
         return attitude(t), p, v, a, omega
 
-    def imu(
-        self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
-    ) -> list[ImuSample]:
+    def imu(self, noise: np.random.Generator, bias: FloatArray) -> list[ImuSample]:
         """Samples at 200 Hz with white noise and constant biases (6,)."""
         rate = 200.0
         out = []
         for k in range(int(self.frames * 10) + 1):
             R, _, _, a, omega = self.state(k / rate)
             gyro = (
-                omega + bias[:3] + noise.normal(0, settings.gyro_noise_density * np.sqrt(rate), 3)
+                omega
+                + bias[:3]
+                + noise.normal(0, DEFAULT_IMU.gyro_noise_density * np.sqrt(rate), 3)
             )
             accel = (
                 R.T @ (a + np.array([0, 0, 9.81]))
                 + bias[3:]
-                + noise.normal(0, settings.accel_noise_density * np.sqrt(rate), 3)
+                + noise.normal(0, DEFAULT_IMU.accel_noise_density * np.sqrt(rate), 3)
             )
             out.append(ImuSample(int(k * 5_000_000), gyro, accel))
         return out
@@ -557,11 +558,7 @@ class Flight:
         """
         noise = np.random.default_rng(seed)
         filt = filter_class(CAMERA, T_CAM0_IMU, settings, motion=motion)  # type: ignore[arg-type]
-        samples = (
-            self.imu(noise, settings, np.zeros(6) if bias is None else bias)
-            if motion == "imu"
-            else []
-        )
+        samples = self.imu(noise, np.zeros(6) if bias is None else bias) if motion == "imu" else []
         errors, covariances = [], []
         fed = 0
         world = TrueWorld(filt, upright=motion == "imu")
@@ -594,7 +591,7 @@ def test_frames_without_features_grow_the_covariance_by_the_motion_model(
     _, _, filt = flight.run(settings, motion)
     window, noise = filt._window, np.random.default_rng(1)
     P = filt._propagation.posterior.own.copy()
-    samples = flight.imu(noise, settings, np.zeros(6)) if motion == "imu" else []
+    samples = flight.imu(noise, np.zeros(6)) if motion == "imu" else []
     other = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
     for sample in samples:
         other.take(sample)
@@ -635,10 +632,10 @@ def test_the_world_stays_where_the_first_window_left_it_while_gravity_becomes_kn
     np.testing.assert_allclose(
         estimate.T_world_imu[:3, 3], R.T @ window.nav.T_world_imu[:3, 3], atol=1e-12
     )
-    np.testing.assert_allclose(np.linalg.norm(estimate.gravity_world), settings.gravity_mps2)
+    np.testing.assert_allclose(np.linalg.norm(estimate.gravity_world), DEFAULT_IMU.gravity_mps2)
 
     # Gravity, seen from the body, is what it is, within its standard deviation.
-    down = estimate.T_world_imu[:3, :3].T @ estimate.gravity_world / settings.gravity_mps2
+    down = estimate.T_world_imu[:3, :3].T @ estimate.gravity_world / DEFAULT_IMU.gravity_mps2
     tilt = np.linalg.norm(
         np.cross(down, flight.state((flight.frames - 1) * 0.05)[0].T @ [0.0, 0, -1])
     )
@@ -1102,9 +1099,7 @@ def test_a_restart_carries_the_pose_on_and_grows_its_covariance_with_the_time_in
     good = filt._good
     sigmas = []
     for elapsed_s in (0.05, 0.2):
-        nav, P = restarted(
-            good, good.time_ns + round(1e9 * elapsed_s), TwistMotion(EXACT_RIG), EXACT_RIG
-        )
+        nav, P = restarted(good, good.time_ns + round(1e9 * elapsed_s), TwistMotion(EXACT_RIG))
         moved = nav.T_world_imu[:3, 3] - good.nav.T_world_imu[:3, 3]
         expected = elapsed_s * (good.nav.T_world_imu[:3, :3] @ good.nav.velocity)
         np.testing.assert_allclose(moved, expected, rtol=0.1, atol=1e-3)

@@ -15,6 +15,7 @@ from vio.filters.imu_start import START_TILT_SIGMA_DEG
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp
+from vio.imu.settings import DEFAULT_IMU, ImuSettings
 from vio.records import ImuSample, VelocitySample
 
 SETTINGS = MsckfSettings()
@@ -29,9 +30,9 @@ ORIGIN = NavState(np.eye(4), *np.zeros((4, 3)))
 
 
 def _imu(
-    hz: int, seconds: float, settings: MsckfSettings = SETTINGS, *, moving: bool = False
+    hz: int, seconds: float, imu: ImuSettings = DEFAULT_IMU, *, moving: bool = False
 ) -> ImuMotion:
-    motion = ImuMotion(settings)
+    motion = ImuMotion(SETTINGS, imu)
     for k in range(round(hz * seconds) + 1):
         t = k / hz
         gyro = np.array([0.5 * np.sin(3 * t), -0.4, 0.3 * t]) if moving else np.zeros(3)
@@ -47,7 +48,7 @@ def test_imu_noise_at_rest_is_that_of_integrated_white_noise(hz: int) -> None:
     """
     T = 0.5
     Q = _imu(hz, T).advance(ORIGIN, 0, round(1e9 * T)).Q
-    s = SETTINGS
+    s = DEFAULT_IMU
     np.testing.assert_allclose(np.diag(Q)[3:6], s.gyro_noise_density**2 * T, rtol=1e-6)
     # A velocity error of gravity's direction change adds to two of the axes, (g t)^2 integrated.
     tilting = np.array([1, 1, 0]) * s.gyro_noise_density**2 * s.gravity_mps2**2 * T**3 / 3
@@ -60,7 +61,7 @@ def test_imu_noise_at_rest_is_that_of_integrated_white_noise(hz: int) -> None:
 
 
 def test_imu_noise_does_not_depend_on_how_the_time_is_cut() -> None:
-    motion = _imu(200, 0.2, replace(SETTINGS, gyro_bias_walk=0.0, accel_bias_walk=0.0), moving=True)
+    motion = _imu(200, 0.2, ImuSettings(gyro_bias_walk=0.0, accel_bias_walk=0.0), moving=True)
     whole = motion.advance(MOVING, 0, 200_000_000)
     first = motion.advance(MOVING, 0, 80_000_000)
     second = motion.advance(first.nav, 80_000_000, 200_000_000)
@@ -153,7 +154,7 @@ def test_start_turns_the_accelerometers_up_to_the_worlds(up: list[float]) -> Non
     np.testing.assert_allclose(R @ up, [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) > 0
-    from_bias = SETTINGS.accel_bias_sigma_mps2 / SETTINGS.gravity_mps2
+    from_bias = DEFAULT_IMU.accel_bias_sigma_mps2 / DEFAULT_IMU.gravity_mps2
     np.testing.assert_allclose(
         np.diag(P)[3:5], np.radians(START_TILT_SIGMA_DEG) ** 2 + from_bias**2
     )
@@ -197,7 +198,7 @@ def test_old_samples_are_dropped_but_not_the_one_that_the_next_interval_begins_w
 def test_the_noise_of_one_reading_is_that_of_the_imus_own_period(hz: int) -> None:
     """Also where old samples are dropped, and one is left."""
     motion = _imu(hz, 1.0)
-    density = SETTINGS.gyro_noise_density
+    density = DEFAULT_IMU.gyro_noise_density
     assert motion.rate_variance(np.ones(2)) == pytest.approx(density**2 * hz)
     motion.forget_before(motion.samples[-1].time_ns)
     assert len(motion.samples) == 1

@@ -82,7 +82,7 @@ class Flown:
         rng = np.random.default_rng(seed)
         bias = np.concatenate([rng.normal(0, 0.05, 3), rng.normal(0, 0.15, 3)])
         self.filter = MonoMsckf(LEFT, T_CAM0_IMU, SETTINGS)
-        samples = flight.imu(rng, SETTINGS, bias)
+        samples = flight.imu(rng, bias)
         self.begun: int | None = None
         world = TrueWorld(self.filter, upright=True)
         rows: list[list[float]] = []
@@ -680,7 +680,7 @@ def test_one_camera_begins_anew_where_it_was_good() -> None:
     rng = np.random.default_rng(0)
     filt = MonoMsckf(LEFT, T_CAM0_IMU, SETTINGS)
     assert filt.begin_anew(filt.estimate()) is None  # nothing to begin anew
-    samples = flight.imu(rng, SETTINGS, np.zeros(6))
+    samples = flight.imu(rng, np.zeros(6))
     again: int | None = None
     for k in range(80):
         while samples and samples[0].time_ns <= k * STEP_NS:

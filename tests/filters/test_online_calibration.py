@@ -32,6 +32,7 @@ from vio.geometry.lie import (
     so3_log,
 )
 from vio.geometry.stereo import StereoCamera
+from vio.imu.settings import DEFAULT_IMU
 from vio.records import Estimate, ImuSample
 
 # the stereo pair
@@ -102,14 +103,12 @@ class Run:
         return float(out + (self.time_offset_error_s[k] / e.time_offset_sigma_s) ** 2)
 
 
-def _samples(
-    flight: Flight, settings: MsckfSettings, offset_s: float, noise: np.random.Generator
-) -> list[ImuSample]:
+def _samples(flight: Flight, offset_s: float, noise: np.random.Generator) -> list[ImuSample]:
     """IMU samples at 200 Hz whose stamps are `offset_s` ahead of the frames' clock."""
     bias = noise.normal(0, [0.02] * 3 + [0.05] * 3)
-    sigmas = np.repeat([settings.gyro_noise_density, settings.accel_noise_density], 3) * np.sqrt(
-        200.0
-    )
+    sigmas = np.repeat(
+        [DEFAULT_IMU.gyro_noise_density, DEFAULT_IMU.accel_noise_density], 3
+    ) * np.sqrt(200.0)
     out = []
     for k in range(-20, 10 * flight.frames + 20):
         R, _, _, a, omega = flight.state(k / 200)
@@ -162,9 +161,7 @@ def _fly(
     """
     noise = np.random.default_rng(seed)
     filt = Msckf(camera, T_CAM0_IMU @ se3_exp(xi), settings, motion="imu")
-    estimates, positions = fly_with(
-        filt, flight, _samples(flight, settings, offset_s, noise), noise, sigma
-    )
+    estimates, positions = fly_with(filt, flight, _samples(flight, offset_s, noise), noise, sigma)
     found = [T_CAM0_IMU if e.T_cam0_imu is None else e.T_cam0_imu for e in estimates]
     offsets = np.array([e.time_offset_s or 0.0 for e in estimates])
     return Run(

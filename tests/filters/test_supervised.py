@@ -30,7 +30,7 @@ def test_images_carry_the_frames_before_an_imu_that_begins_late() -> None:
     """
     flight, settings, rng = Flight(64), EXACT_RIG, np.random.default_rng(3)
     filt = SupervisedMsckf(CAMERA, T_CAM0_IMU, settings)
-    samples = [x for x in flight.imu(rng, settings, np.zeros(6)) if x.time_ns > 1_480_000_000]
+    samples = [x for x in flight.imu(rng, np.zeros(6)) if x.time_ns > 1_480_000_000]
     errors, covariances = [], []
     for k in range(flight.frames):
         while samples and samples[0].time_ns <= k * STEP_NS:
@@ -65,7 +65,7 @@ def spliced() -> tuple[Flight, SupervisedMsckf, list[Estimate]]:
     flight = Flight(150)
     rng = np.random.default_rng(5)
     filt = SupervisedMsckf(CAMERA, T_CAM0_IMU, EXACT_RIG)
-    samples = flight.imu(rng, EXACT_RIG, np.zeros(6))
+    samples = flight.imu(rng, np.zeros(6))
     estimates = []
     good: Estimate | None = None
     for k in range(95):

@@ -68,7 +68,7 @@ def _images(held: Held, **options: Any) -> LiveOdometry:
 
 def _events(frames: int = FRAMES) -> tuple[list[ImuSample], list[Any]]:
     flight, noise = Flight(frames=frames + 1), np.random.default_rng(3)
-    samples = flight.imu(noise, Config().msckf, np.zeros(6))
+    samples = flight.imu(noise, np.zeros(6))
     return samples, [flight.observe(k, 0.3, noise) for k in range(frames)]
 
 

@@ -213,7 +213,7 @@ def test_streams_that_nobody_reads_are_forgotten() -> None:
 
 def test_a_prediction_that_lags_is_answered_from_what_was_known() -> None:
     flight = Flight(frames=60)
-    samples = flight.imu(np.random.default_rng(0), Config().msckf, np.zeros(6))
+    samples = flight.imu(np.random.default_rng(0), np.zeros(6))
     with LiveOdometry(CAMERA, T_cam0_imu=T_CAM0_IMU, drop="none") as live:
         stream = iter(live)
         for k in range(60):

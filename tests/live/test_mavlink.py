@@ -240,7 +240,7 @@ def autopilot() -> Iterator[Autopilot]:
 
 def _fly(live: LiveOdometry, frames: int = 12, from_ns: int = 0, imu: bool = True) -> None:
     flight = Flight(frames=frames + 1)
-    samples = flight.imu(np.random.default_rng(3), Config().msckf, np.zeros(6)) if imu else []
+    samples = flight.imu(np.random.default_rng(3), np.zeros(6)) if imu else []
     for k in range(frames):
         for s in samples:
             if (k - 1) * STEP_NS < s.time_ns <= k * STEP_NS:

@@ -116,7 +116,7 @@ def test_live_events_give_the_poses_of_the_recorded_run(
 def _fly(odometry: Odometry, frames: int = 30, first: int = 0) -> list[Estimate]:
     """Feed features and IMU samples of a flight."""
     flight, noise = Flight(frames=frames + 1), np.random.default_rng(3)
-    samples = flight.imu(noise, Config().msckf, np.zeros(6)) if odometry.motion == "imu" else []
+    samples = flight.imu(noise, np.zeros(6)) if odometry.motion == "imu" else []
     out = []
     for k in range(first, frames):
         for s in samples:
@@ -155,7 +155,7 @@ def test_a_prediction_between_frames_is_as_good_as_the_next_frame(motion: Any) -
     last = _fly(odometry)[-1]
     flight = Flight(frames=40)
     if motion == "imu":
-        for s in flight.imu(np.random.default_rng(4), Config().msckf, np.zeros(6)):
+        for s in flight.imu(np.random.default_rng(4), np.zeros(6)):
             if 29 * STEP_NS < s.time_ns <= 30 * STEP_NS:
                 odometry.add_imu(s.time_ns, s.gyro, s.accel)
     for part in (0.0, 0.3, 0.5, 1.0):

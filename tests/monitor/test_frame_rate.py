@@ -98,7 +98,7 @@ def test_a_live_run_leaves_out_what_a_recorded_one_does() -> None:
         for settings in (DatasetSettings(), TEN)
     )
     flight, noise = Flight(frames=21), np.random.default_rng(3)
-    samples = flight.imu(noise, Config().msckf, np.zeros(6))
+    samples = flight.imu(noise, np.zeros(6))
     for k in range(20):
         seen = flight.observe(k, 0.3, noise)
         for odometry in (every, half):

@@ -35,10 +35,8 @@ class Faulty(Flight):
         super().__init__(FRAMES)
         self.change = change
 
-    def imu(
-        self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray
-    ) -> list[ImuSample]:
-        samples = super().imu(noise, settings, bias)
+    def imu(self, noise: np.random.Generator, bias: FloatArray) -> list[ImuSample]:
+        samples = super().imu(noise, bias)
         return [self.change(k, x, samples[300]) for k, x in enumerate(samples)]
 
 
@@ -226,11 +224,11 @@ def _lines(samples: list[ImuSample]) -> list[str]:
 
 
 def _faulty(change: Change) -> list[ImuSample]:
-    return Faulty(change).imu(np.random.default_rng(1), MsckfSettings(), np.zeros(6))
+    return Faulty(change).imu(np.random.default_rng(1), np.zeros(6))
 
 
 def test_a_clean_imu_gives_no_line() -> None:
-    assert _lines(Flight(FRAMES).imu(np.random.default_rng(1), MsckfSettings(), np.zeros(6))) == []
+    assert _lines(Flight(FRAMES).imu(np.random.default_rng(1), np.zeros(6))) == []
 
 
 @pytest.mark.parametrize(
@@ -347,7 +345,7 @@ def test_stamps_in_bursts_are_named_with_the_mean_rate() -> None:
 
 @pytest.mark.parametrize("fault", [_one_gyro_spike, _two_per_mille, _zeros, _stuck, _dead_gyro])
 def test_samples_of_a_frame_at_once_are_judged_as_one_by_one(fault: Change) -> None:
-    samples = Faulty(fault).imu(np.random.default_rng(3), MsckfSettings(), np.zeros(6))
+    samples = Faulty(fault).imu(np.random.default_rng(3), np.zeros(6))
     single, at_once = ImuSampleCheck(), ImuSampleCheck()
     expected = [x.time_ns for sample in samples for x in single.take_all([sample])]
     cuts = np.cumsum(np.random.default_rng(4).integers(0, 25, len(samples)))

@@ -125,9 +125,7 @@ def _flight_log(
     recording = Recording(
         "flight", Path("flight"), camera, T_CAM0_IMU, times, False, frozenset({"imu"}), None
     )
-    samples = [
-        s for s in flight.imu(noise, Config().msckf, np.zeros(6)) if s.time_ns >= imu_from_ns
-    ]
+    samples = [s for s in flight.imu(noise, np.zeros(6)) if s.time_ns >= imu_from_ns]
     seen = [flight.observe(k, 0.3, noise) for k in range(frames)]
     write_observation_log(path, recording, seen, samples, run_motion="imu")  # type: ignore[arg-type]
     return path

@@ -145,16 +145,12 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _densities(file: Path | None) -> ImuDensities:
-    """Return the IMU's noise: a file's, or the filter's own."""
+    """Return the IMU's noise: a file's, or that of the settings."""
     from vio.config import Config
     from vio.datasets.yaml_files import imu_densities, read_yaml_file
-    from vio.records import ImuDensities
 
     if file is None:
-        own = Config().msckf
-        return ImuDensities(
-            own.gyro_noise_density, own.gyro_bias_walk, own.accel_noise_density, own.accel_bias_walk
-        )
+        return Config().imu.densities
     found = imu_densities(read_yaml_file(file, "Kalibr's IMU noise"), file)
     if found is None:
         raise ConfigError(f"{file}: holds no noise densities; write them by vio imu-noise")

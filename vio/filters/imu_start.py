@@ -15,8 +15,8 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.errors import EstimationError
-from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, so3_exp
+from vio.imu.settings import ImuSettings
 from vio.imu.standstill import NOISE_FACTOR, STANDSTILL_S, blocks_agree
 from vio.records import ImuSample
 
@@ -37,13 +37,13 @@ class ImuStart:
     accel_sigma_mps2: float  # standard deviation of the mean acceleration, horizontal, per axis
 
 
-def imu_start(samples: Sequence[ImuSample], time_ns: int, settings: MsckfSettings) -> ImuStart:
+def imu_start(samples: Sequence[ImuSample], time_ns: int, imu: ImuSettings) -> ImuStart:
     """Judge the last half second of samples before a time.
 
     Args:
         samples: one or more, in time order; where all are later, the first is taken.
         time_ns: time of the first frame.
-        settings: noise densities, standard deviations of the biases and of a start in motion.
+        imu: noise densities, standard deviations of the biases, gravity.
 
     Raises:
         EstimationError: the accelerometer reads nothing.
@@ -57,7 +57,7 @@ def imu_start(samples: Sequence[ImuSample], time_ns: int, settings: MsckfSetting
     length = float(np.linalg.norm(force))
     if length < 1e-3:
         raise EstimationError("the accelerometer reads zero; is it in m/s^2, with gravity in it?")
-    s = settings
+    s = imu
     span_s = max(-float(times_s[0]), 1e-3) if len(recent) > 1 else 5e-3
     force_noise, rate_noise = (
         d / np.sqrt(span_s) for d in (s.accel_noise_density, s.gyro_noise_density)

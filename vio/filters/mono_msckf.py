@@ -29,6 +29,7 @@ from vio.filters.window_posterior import scale_sigma
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.geometry.upright import nearest_yaw
+from vio.imu.settings import DEFAULT_IMU, ImuSettings
 from vio.imu.standstill import STANDSTILL_S
 from vio.records import (
     Estimate,
@@ -56,11 +57,15 @@ class MonoMsckf(Msckf):
     """
 
     def __init__(
-        self, camera: StereoCamera, T_cam0_imu: FloatArray, settings: MsckfSettings
+        self,
+        camera: StereoCamera,
+        T_cam0_imu: FloatArray,
+        settings: MsckfSettings,
+        imu: ImuSettings = DEFAULT_IMU,
     ) -> None:
         """Prepare; the arguments are those of `Msckf`."""
-        super().__init__(camera, T_cam0_imu, _for_one_camera(settings), motion="imu")
-        self._starter = MonoStarter(camera, self._calibration.T_cam0_imu, settings)
+        super().__init__(camera, T_cam0_imu, _for_one_camera(settings), motion="imu", imu=imu)
+        self._starter = MonoStarter(camera, self._calibration.T_cam0_imu, settings, imu)
         self._begun: MonoStart | None = None
         self._resumed: GoodState | None = None  # after a divergence
         self._recent: deque[Observations] = deque()  # of the last half second
@@ -73,6 +78,7 @@ class MonoMsckf(Msckf):
         T_cam0_body: FloatArray,
         settings: MsckfSettings,
         motion: MotionSource | None,
+        imu: ImuSettings,
     ) -> MonoMsckf:
         """Build the filter of a run, see `Backend`.
 
@@ -91,7 +97,7 @@ class MonoMsckf(Msckf):
                 "of one camera is the "
                 "accelerometer's; set it to off"
             )
-        return cls(camera, T_cam0_body, settings)
+        return cls(camera, T_cam0_body, settings, imu)
 
     @property
     def initialisation(self) -> Initialisation:
@@ -144,7 +150,7 @@ class MonoMsckf(Msckf):
         """A start after a divergence in the world of before, where position and yaw are those
         held since.
         """
-        held, P_held = restarted(good, time_ns, self._propagation.motion, self._settings)
+        held, P_held = restarted(good, time_ns, self._propagation.motion)
         R = held.T_world_imu[:3, :3]
         R_new = begun.nav.T_world_imu[:3, :3]
         yaw = so3_exp([0.0, 0.0, nearest_yaw(R @ R_new.T)])
@@ -183,7 +189,9 @@ class MonoMsckf(Msckf):
         self._good = None
         self._propagation.forget()
         self._forget_tracks(good)
-        self._starter = MonoStarter(self._rig.camera, self._calibration.T_cam0_imu, self._settings)
+        self._starter = MonoStarter(
+            self._rig.camera, self._calibration.T_cam0_imu, self._settings, self._imu
+        )
 
     def _wait(self, observations: Observations) -> UpdateReport:
         return replace(super()._wait(observations), started=False)
@@ -215,7 +223,7 @@ class MonoMsckf(Msckf):
         now = self._recent[-1].time_ns
         if not self._settings.zero_velocity or now - STANDSTILL_S * 1e9 < self._stationary_ns:
             return
-        if not is_still(self._recent, list(self._samples), self._settings):
+        if not is_still(self._recent, list(self._samples), self._imu):
             return
         measurement = self._propagation.motion.zero_velocity(window.nav, self._propagation.gyro)
         if measurement is not None:

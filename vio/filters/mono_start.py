@@ -44,6 +44,7 @@ from vio.filters.window_tracks import LinearTracks, WindowTracks, chi_square_tab
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera, left_rays
 from vio.geometry.upright import rotation_to_up
+from vio.imu.settings import ImuSettings
 from vio.imu.standstill import STANDSTILL_S
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import ImuSample, Observations, shared_rows
@@ -92,7 +93,7 @@ class MonoStart:
 
 
 def is_still(
-    frames: Sequence[Observations], samples: Sequence[ImuSample], settings: MsckfSettings
+    frames: Sequence[Observations], samples: Sequence[ImuSample], imu: ImuSettings
 ) -> bool:
     """Whether IMU and tracks show a standstill over the last half second: noise alone, and no
     motion of the features.
@@ -103,7 +104,7 @@ def is_still(
     Args:
         frames: in order of time, the newest last.
         samples: of the IMU, likewise.
-        settings: noise densities and standard deviations of the biases.
+        imu: noise densities and standard deviations of the biases.
     """
     now = frames[-1]
     before = [f for f in frames if now.time_ns - f.time_ns >= 0.9e9 * STANDSTILL_S]
@@ -113,20 +114,23 @@ def is_still(
     if len(a) < _START.min_tracks:
         return False
     moved = np.linalg.norm(before[-1].z[a, :2] - now.z[b, :2], axis=1)
-    return (
-        bool(np.median(moved) < _START.still_px) and imu_start(samples, now.time_ns, settings).still
-    )
+    return bool(np.median(moved) < _START.still_px) and imu_start(samples, now.time_ns, imu).still
 
 
 class MonoStarter:
     """Collects frames until one of them can begin."""
 
     def __init__(
-        self, camera: StereoCamera, T_cam0_imu: FloatArray, settings: MsckfSettings
+        self,
+        camera: StereoCamera,
+        T_cam0_imu: FloatArray,
+        settings: MsckfSettings,
+        imu: ImuSettings,
     ) -> None:
         self._camera = camera
         self._T_cam0_imu = T_cam0_imu
         self._settings = replace(settings, clones=_START.views, max_features=_START.max_tracks)
+        self._imu = imu
         self._frames: deque[Observations] = deque()
         self._passed = 0
         # stamp of the first view at which features and IMU did
@@ -148,7 +152,7 @@ class MonoStarter:
         if not motion.ready:
             self.why = "no IMU sample has come"
             return None
-        if is_still(self._frames, motion.samples, self._settings):
+        if is_still(self._frames, motion.samples, self._imu):
             return self._still_start(motion)
         span_s = (seen.time_ns - self._frames[0].time_ns) * 1e-9
         if span_s < _START.min_span_s:
@@ -216,13 +220,13 @@ class MonoStarter:
         rays = rays / np.linalg.norm(rays, axis=2, keepdims=True)
         bearings = Bearings(rays, seen_of.weight[..., 0] > 0, T_imu_cam0[:3, 3])
         zero = np.zeros(3)
-        sigma = self._settings.gyro_bias_sigma_radps
+        sigma = self._imu.gyro_bias_sigma_radps
         nav = NavState(np.eye(4), zero, zero, zero, zero)
         for _ in range(2):
             free = self._free_motion(motion, views, nav)
             nav = replace(nav, gyro_bias=nav.gyro_bias + gyro_bias(bearings, free, sigma))
         found = align_visual_inertial(
-            bearings, self._free_motion(motion, views, nav), self._settings.gravity_mps2
+            bearings, self._free_motion(motion, views, nav), self._imu.gravity_mps2
         )
         return None if found is None else _upright(nav, found)
 
@@ -243,7 +247,7 @@ class MonoStarter:
             phi_D_bias.append(growth.Phi[3:6, 9:12])
         t = np.array([view.time_ns - begin_ns for view in views]) * 1e-9
         T = np.array([s.T_world_imu for s in states])
-        fallen = 0.5 * t[:, None] ** 2 * np.array([0.0, 0.0, -self._settings.gravity_mps2])
+        fallen = 0.5 * t[:, None] ** 2 * np.array([0.0, 0.0, -self._imu.gravity_mps2])
         return FreeMotion(t, T[:, :3, :3], T[:, :3, 3] - fallen, np.array(phi_D_bias))
 
     def _fit(
@@ -312,7 +316,7 @@ class MonoStarter:
 
     def _window(self, motion: ImuMotion, views: list[Observations], begin: NavState) -> Window:
         """The window of all views, predicted from a first state, under the prior alone."""
-        s = self._settings
+        s = self._imu
         sigmas = [0.0, START_VELOCITY_SIGMA_MPS, s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2]
         P = np.diag(
             np.concatenate([[0.0] * 3, [_TILT_SIGMA_RAD] * 2, np.repeat(sigmas, [1, 3, 3, 3])]) ** 2

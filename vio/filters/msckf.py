@@ -48,6 +48,7 @@ from vio.geometry.lie import (
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.geometry.upright import nearest_yaw
+from vio.imu.settings import DEFAULT_IMU, ImuSettings
 from vio.protocols import Backend
 from vio.records import (
     Estimate,
@@ -79,6 +80,7 @@ class Msckf(Backend):
         settings: MsckfSettings,
         *,
         motion: MotionSource | None,
+        imu: ImuSettings = DEFAULT_IMU,
     ) -> None:
         """Prepare; the first frame initialises the state.
 
@@ -87,6 +89,7 @@ class Msckf(Backend):
             T_cam0_imu: extrinsics (4, 4).
             settings: the filter's section of the configuration.
             motion: which motion samples will come; None: images alone.
+            imu: the IMU's section of the configuration.
 
         Raises:
             ConfigError: the calibration is to be estimated without an IMU, or an argument is of
@@ -110,12 +113,13 @@ class Msckf(Backend):
         if camera.is_cylinder:  # equation (R4) is a pinhole's
             settings = replace(settings, calibrate_scale="off")
         self._settings = settings
+        self._imu = imu
         self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings, motion)
         self._order = InputOrder("msckf")
         self._source = motion
         self._window: Window | None = None
         self._rig = RigCalibration(camera, settings)
-        self._propagation = Propagation(motion, settings)
+        self._propagation = Propagation(motion, settings, imu)
         self._points = PointMap()
         self._frame = FrameUpdate(settings, self._rig, self._propagation, self._points)
         self._began_ns = 0
@@ -298,7 +302,7 @@ class Msckf(Backend):
     def _go_on_from(self, good: GoodState, time_ns: int) -> None:
         """Empty the window at the time of a frame, to which a good state is carried."""
         propagation = self._propagation
-        nav, P = restarted(good, time_ns, propagation.motion, self._settings)
+        nav, P = restarted(good, time_ns, propagation.motion)
         window = self._window = self._first_window(nav, P, good.calibration)
         propagation.begin(window, time_ns, propagation.body_time(window, time_ns))
         self._forget_tracks(good)
@@ -350,7 +354,7 @@ class Msckf(Backend):
             gyro_bias_sigma=known.gyro_bias_sigma,
             accel_bias=window.nav.accel_bias,
             accel_bias_sigma=known.accel_bias_sigma,
-            **(_vertical(window, own, self._settings) if self._source == "imu" else {}),
+            **(_vertical(window, own, self._imu) if self._source == "imu" else {}),
             **self._rig.report(window, own),
         )
 
@@ -379,7 +383,7 @@ class Msckf(Backend):
         return (
             found
             if found is None or window is None
-            else replace(found, gravity_world=_gravity(window, self._settings))
+            else replace(found, gravity_world=_gravity(window, self._imu))
         )
 
     def relative(self, older: int, newer: int) -> RelativePose | None:
@@ -490,20 +494,20 @@ class Msckf(Backend):
             self._stationary_ns = window.clones[-1].time_ns
 
 
-def _vertical(window: Window, own: FloatArray, settings: MsckfSettings) -> dict[str, Any]:
+def _vertical(window: Window, own: FloatArray, imu: ImuSettings) -> dict[str, Any]:
     """The fields of `Estimate` that say where gravity points, by the upright covariance (15 + C,
     15 + C).
     """
     (xx, xy), (_, yy) = own[3:5, 3:5].tolist()
     sigma = math.sqrt(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy))  # of the larger eigenvalue
-    return {"tilt_sigma_rad": sigma, "gravity_world": _gravity(window, settings)}
+    return {"tilt_sigma_rad": sigma, "gravity_world": _gravity(window, imu)}
 
 
-def _gravity(window: Window, settings: MsckfSettings) -> FloatArray | None:
+def _gravity(window: Window, imu: ImuSettings) -> FloatArray | None:
     """Gravity (3,) in the world that is reported, m/s^2; None: along -z."""
     if "first_attitude" not in window.state:
         return None
-    out: FloatArray = window.calibration.R_upright_world.T @ [0.0, 0.0, -settings.gravity_mps2]
+    out: FloatArray = window.calibration.R_upright_world.T @ [0.0, 0.0, -imu.gravity_mps2]
     return out
 
 

@@ -9,6 +9,7 @@ from vio.filters.settings import MsckfSettings
 from vio.filters.supervised import SupervisedMsckf
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.imu.settings import ImuSettings
 from vio.protocols import Backend
 from vio.records import MotionSource
 
@@ -25,6 +26,7 @@ class MsckfOfRig(Msckf):
         T_cam0_body: FloatArray,
         settings: MsckfSettings,
         motion: MotionSource | None,
+        imu: ImuSettings,
     ) -> Backend:
         """Build the filter of a run, see `Backend`.
 
@@ -34,7 +36,7 @@ class MsckfOfRig(Msckf):
         if camera.kind == "mono":
             from vio.filters.mono_msckf import MonoMsckf
 
-            return MonoMsckf.build(camera, T_cam0_body, settings, motion)
+            return MonoMsckf.build(camera, T_cam0_body, settings, motion, imu)
         if motion == "imu":
-            return SupervisedMsckf(camera, T_cam0_body, settings)
-        return Msckf(camera, T_cam0_body, settings, motion=motion)
+            return SupervisedMsckf(camera, T_cam0_body, settings, imu)
+        return Msckf(camera, T_cam0_body, settings, motion=motion, imu=imu)

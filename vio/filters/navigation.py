@@ -43,6 +43,7 @@ from vio.geometry.lie import (
 )
 from vio.geometry.upright import rotation_to_up
 from vio.imu.faults import ImuSampleCheck, readings_of
+from vio.imu.settings import DEFAULT_IMU, ImuSettings
 from vio.numerics.compiled import move_by_twist
 from vio.records import ImuSample, MotionSample, VelocitySample
 
@@ -142,13 +143,13 @@ class Measurement:
 class ImuMotion:
     """Gyro and accelerometer, gravity, two biases that walk."""
 
-    def __init__(self, settings: MsckfSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: MsckfSettings, imu: ImuSettings = DEFAULT_IMU) -> None:
+        self._imu = imu
         self._chosen = CHOSEN[settings.calibrate_imu]  # the IMU's terms that are estimated
         # (6,) mean reading `[gyro, accel]` of the last second; kept where terms are estimated.
         self._usual: FloatArray | None = None
-        self._gravity = np.array([0.0, 0.0, -settings.gravity_mps2])
-        self._walks = np.array([settings.gyro_bias_walk, settings.accel_bias_walk])
+        self._gravity = np.array([0.0, 0.0, -imu.gravity_mps2])
+        self._walks = np.array([imu.gyro_bias_walk, imu.accel_bias_walk])
         self._new: list[ImuSample] = []  # not checked yet
         self._kept: list[ImuSample] = []
         self._history = ImuHistory()
@@ -192,7 +193,7 @@ class ImuMotion:
         Raises:
             EstimationError: the accelerometer reads nothing.
         """
-        s = self._settings
+        s = self._imu
         begin = imu_start(self.samples, time_ns, s)
         R = rotation_to_up(begin.force / np.linalg.norm(begin.force))
         T = se3_from_parts(R, np.zeros(3))
@@ -223,11 +224,11 @@ class ImuMotion:
         )
         return nav, P
 
-    def start_covariance(self, settings: MsckfSettings) -> FloatArray:
+    def start_covariance(self) -> FloatArray:
         """Covariance (15, 15) of velocity and biases of which nothing is known; that of the pose
         is zero.
         """
-        s = settings
+        s = self._imu
         sigmas = [
             0.0,
             0.0,
@@ -251,7 +252,7 @@ class ImuMotion:
         """
         times, raw, hidden = self._interval(start_ns, end_ns)
         readings = calibrated(raw, nav.imu_terms) if len(self._chosen) else raw
-        s = self._settings
+        s = self._imu
         steps = len(times) - 1
         densities = factors * [s.accel_noise_density, s.gyro_noise_density]
         variance = np.zeros((2, steps)) if hidden is None else hidden.variance
@@ -326,7 +327,7 @@ class ImuMotion:
         """
         if gyro is None:
             return None
-        s = self._settings
+        s = self._imu
         turn = gyro - nav.gyro_bias
         if np.abs(turn).max() > 3 * (ZERO_RATE_SIGMA_RADPS + s.gyro_bias_sigma_radps):
             return None
@@ -402,7 +403,7 @@ class ImuMotion:
         # new samples come into the history here
         period_ns = self._history.period_ns() if self.samples else 0.0
         period_s = period_ns * 1e-9 if period_ns > 0 else _SAMPLE_S
-        return float((factors[1] * self._settings.gyro_noise_density) ** 2 / period_s)
+        return float((factors[1] * self._imu.gyro_noise_density) ** 2 / period_s)
 
     def covered(self, time_ns: int) -> int:
         """The latest time, up to a given one, that the samples reach; the given one where they
@@ -462,9 +463,9 @@ class TwistMotion:
         the body is.
         """
         zero = np.zeros(3)
-        return NavState(np.eye(4), zero, zero, zero, zero), self.start_covariance(self._settings)
+        return NavState(np.eye(4), zero, zero, zero, zero), self.start_covariance()
 
-    def start_covariance(self, settings: MsckfSettings) -> FloatArray:
+    def start_covariance(self) -> FloatArray:
         """Covariance (15, 15) of twist and rate bias of which nothing is known; that of the pose
         is zero.
         """

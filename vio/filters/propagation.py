@@ -24,6 +24,7 @@ from vio.filters.online_calibration import NO_TWIST, Twist, body_twist, walk_var
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
+from vio.imu.settings import ImuSettings
 from vio.records import ImuSample, MotionPrior, MotionSample, MotionSource
 
 # Factors on the motion model's densities: at the start, at least, at most.
@@ -100,11 +101,13 @@ _NOTHING = FramePosterior(np.zeros((DIM, DIM)), np.zeros((DIM + 6, DIM + 6)), np
 class Propagation:
     """The motion model, its noise, and how far it has carried the navigation state."""
 
-    def __init__(self, source: MotionSource | None, settings: MsckfSettings) -> None:
+    def __init__(
+        self, source: MotionSource | None, settings: MsckfSettings, imu: ImuSettings
+    ) -> None:
         """Prepare; no window exists yet."""
         self.source = source
         self.motion: ImuMotion | TwistMotion = (
-            ImuMotion(settings) if source == "imu" else TwistMotion(settings)
+            ImuMotion(settings, imu) if source == "imu" else TwistMotion(settings)
         )
         self.walk = walk_variances(settings)  # a second
         self.noise = self.unknown_noise()

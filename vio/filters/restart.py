@@ -11,7 +11,6 @@ from vio.dataclass import dataclass
 from vio.errors import EstimationError
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.online_calibration import Calibration, body_twist
-from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_from_parts, so3_hat
 from vio.geometry.upright import rotated
 from vio.records import NS_PER_S, Estimate
@@ -52,7 +51,7 @@ def required(good: GoodState | None) -> GoodState:
 
 
 def restarted(
-    good: GoodState, time_ns: int, motion: ImuMotion | TwistMotion, settings: MsckfSettings
+    good: GoodState, time_ns: int, motion: ImuMotion | TwistMotion
 ) -> tuple[NavState, FloatArray]:
     """Return the navigation state at a later time and its covariance (15, 15), both from the last
     good state.
@@ -65,7 +64,6 @@ def restarted(
         good: the state to go on from.
         time_ns: of the frame to go on with.
         motion: the filter's motion model.
-        settings: initial standard deviations.
     """
     elapsed_s = (time_ns - good.time_ns) * 1e-9
     nav = good.nav
@@ -78,7 +76,7 @@ def restarted(
     J[:3, 3:] = so3_hat(moved.T_world_imu[:3, 3])
     P = np.zeros((DIM, DIM))
     P[:6, :6] = good.covariance[:6, :6] + J @ np.diag(np.repeat([position, rotation], 3) ** 2) @ J.T
-    P[6:, 6:] = motion.start_covariance(settings)[6:, 6:]
+    P[6:, 6:] = motion.start_covariance()[6:, 6:]
     return moved, P
 
 

@@ -27,6 +27,7 @@ from vio.geometry.lie import (
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.geometry.upright import nearest_yaw
+from vio.imu.settings import DEFAULT_IMU, ImuSettings
 from vio.imu.standstill import STANDSTILL_S
 from vio.protocols import Backend
 from vio.records import (
@@ -98,11 +99,15 @@ class SupervisedMsckf(Backend):
     motion_sources = Msckf.motion_sources
 
     def __init__(
-        self, camera: StereoCamera, T_cam0_imu: FloatArray, settings: MsckfSettings
+        self,
+        camera: StereoCamera,
+        T_cam0_imu: FloatArray,
+        settings: MsckfSettings,
+        imu: ImuSettings = DEFAULT_IMU,
     ) -> None:
         """Prepare; the arguments are those of `Msckf`."""
         self._given = (camera, T_cam0_imu, settings)
-        self._gravity_mps2 = settings.gravity_mps2
+        self._imu = imu
         self._filter = self._new()
         self._stand_in: Msckf | None = None  # images alone, until the first sample
         self._handover: _Handover | None = None
@@ -112,12 +117,12 @@ class SupervisedMsckf(Backend):
 
     def _new(self) -> Msckf:
         camera, T_cam0_imu, settings = self._given
-        return Msckf(camera, T_cam0_imu, settings, motion="imu")
+        return Msckf(camera, T_cam0_imu, settings, motion="imu", imu=self._imu)
 
     def _without_imu(self) -> Msckf:
         camera, T_cam0_imu, settings = self._given
         without = replace(settings, calibrate_camera_imu="none", calibrate_imu="off")
-        return Msckf(camera, T_cam0_imu, without, motion=None)
+        return Msckf(camera, T_cam0_imu, without, motion=None, imu=self._imu)
 
     @property
     def _active(self) -> Msckf:
@@ -258,7 +263,7 @@ class SupervisedMsckf(Backend):
     def _reported(self, estimate: Estimate) -> Estimate:
         if self._stand_in is not None or self._handover is None:
             return estimate
-        return self._handover.estimate(estimate, self._gravity_mps2)
+        return self._handover.estimate(estimate, self._imu.gravity_mps2)
 
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since.

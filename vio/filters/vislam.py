@@ -18,6 +18,7 @@ from vio.filters.settings import VislamSettings
 from vio.filters.vislam_motion import DriftingTwist, HeldInput
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.imu.settings import ImuSettings
 from vio.numerics.statistics import chi_square_quantile
 from vio.protocols import Backend
 from vio.records import (
@@ -194,6 +195,7 @@ class Vislam(Backend):
         T_cam0_body: FloatArray,
         settings: VislamSettings,
         motion: MotionSource | None,
+        imu: ImuSettings,
     ) -> Vislam:
         """Build the filter of a run, see `Backend`.
 

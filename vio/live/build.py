@@ -233,7 +233,7 @@ def build_backend(
 ) -> Backend:
     """Build the configured back end; `T_cam0_body` is (4, 4)."""
     settings = getattr(config, config.backend, None)
-    return backend_class(config.backend).build(camera, T_cam0_body, settings, motion)
+    return backend_class(config.backend).build(camera, T_cam0_body, settings, motion, config.imu)
 
 
 def _record(features: Dataset | None) -> Callable[[], list[Observations]] | None:

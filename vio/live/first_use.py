@@ -87,7 +87,7 @@ def _run_frontend(config: Config) -> None:
     from vio.live.warm_up import SwayingCamera
 
     frontend = build_frontend("auto", _CAMERA, config.frontend)
-    source = SwayingCamera(_CAMERA, np.eye(4), config.msckf.gravity_mps2)
+    source = SwayingCamera(_CAMERA, np.eye(4), config.imu.gravity_mps2)
     for index in range(_FRAMES):
         time_ns = index * _STEP_NS
         left, right, _ = source.images(time_ns)
@@ -100,7 +100,7 @@ def _run_filter(config: Config) -> None:
 
     T_cam0_imu = np.eye(4) if config.motion == "imu" else None
     odometry = Odometry(_CAMERA, config, T_cam0_imu=T_cam0_imu)
-    source = SwayingCamera(_CAMERA, odometry.T_cam0_body, config.msckf.gravity_mps2)
+    source = SwayingCamera(_CAMERA, odometry.T_cam0_body, config.imu.gravity_mps2)
     features = _Features()
     for index in range(_FRAMES):
         time_ns = index * _STEP_NS

@@ -189,7 +189,7 @@ class LiveOdometry(EventInputs[None]):
         self._on_frame = on_frame
         self._sink = sink
         self._with_map = use is not None
-        self._predictor = SharedPredictor(self._config.msckf.gravity_mps2)
+        self._predictor = SharedPredictor(self._config.imu.gravity_mps2)
         self._monitor = LiveMonitor(judges_latency=drop != "block")
         self._collector = QuietCollector()
         self._streams = _Streams()
@@ -258,7 +258,7 @@ class LiveOdometry(EventInputs[None]):
 
     def _forget(self) -> None:
         """Begin with an empty trajectory."""
-        self._predictor = SharedPredictor(self._config.msckf.gravity_mps2)
+        self._predictor = SharedPredictor(self._config.imu.gravity_mps2)
         self._points.clear()
 
     def close(self) -> None:

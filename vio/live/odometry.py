@@ -148,7 +148,7 @@ class Odometry(EventInputs["Estimate | None"]):
         self._frontend = _LiveFrontend(self.camera, self._config.frontend)
         parts = replace(self._parts, frontend=self._parts.frontend or self._frontend)
         self._processor = build_processor(self._source, self._config, parts, self._map)
-        self._predictor = PosePredictor(self._config.msckf.gravity_mps2)
+        self._predictor = PosePredictor(self._config.imu.gravity_mps2)
         self._inputs = Inputs(
             self.camera.kind,
             _image_shapes(self.camera, self._rectifier),

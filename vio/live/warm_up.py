@@ -53,7 +53,7 @@ def warm_up(
         from vio.mapping.features import extract
 
         left, right, _ = SwayingCamera(
-            camera, odometry.T_cam0_body, config.msckf.gravity_mps2
+            camera, odometry.T_cam0_body, config.imu.gravity_mps2
         ).images(0)
         assert right is not None  # of other cameras there is no map
         extract(left, right)
@@ -69,7 +69,7 @@ def _configs(config: Config) -> list[Config]:
 
 def sway(odometry: Odometry, config: Config) -> None:
     """Give an odometry the images and motion samples of two seconds."""
-    source = SwayingCamera(odometry.camera, odometry.T_cam0_body, config.msckf.gravity_mps2)
+    source = SwayingCamera(odometry.camera, odometry.T_cam0_body, config.imu.gravity_mps2)
     for frame in range(_FRAMES):
         time_ns = frame * _STEP_NS
         for k in range(1 - _SAMPLES, 1):

@@ -17,11 +17,12 @@ from vio.filters.rig_calibration import constant_sigmas, field_sigmas
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
 from vio.imu.preintegration import BodyStates, Readings
+from vio.imu.settings import ImuSettings
 from vio.numerics.robust import robust_sigma
 from vio.offline.inertial_adjustment import InertialAdjustment, Optimum, RigPrior
 from vio.offline.keyframes import TrackedPath, loop_ends
 from vio.offline.points import PointTracks, build_tracks, reprojection
-from vio.records import FIELD_TERMS, ROW_TERMS, ImuDensities, ImuSample, IntArray, MotionSample
+from vio.records import FIELD_TERMS, ROW_TERMS, ImuSample, IntArray, MotionSample
 
 _EVERY_S = 0.25  # from keyframe to keyframe
 # On the standard deviations of pixels: errors of a track last longer than from keyframe to
@@ -41,6 +42,7 @@ class InertialRun:
     T_cam0_imu: FloatArray  # (4, 4) as given
     field: DisplacementField | None  # what was taken out of the path's pixels
     settings: MsckfSettings
+    imu: ImuSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +84,7 @@ def adjust_with_imu(
         VioError: the run has too few views or no consistent track.
     """
     path = run.path
-    s = run.settings
+    s = run.imu
     T = path.trajectory.T_world_body[keyframes]
     tracks = build_tracks(path, keyframes, T)
     here = run.known[keyframes]
@@ -96,15 +98,12 @@ def adjust_with_imu(
     bias = np.nan_to_num(np.concatenate([here["gyro_bias"], here["accel_bias"]], axis=1))
     motion = [x for x in run.samples if isinstance(x, ImuSample)]
     values = np.array([[*x.gyro, *x.accel] for x in motion])
-    densities = ImuDensities(
-        s.gyro_noise_density, s.gyro_bias_walk, s.accel_noise_density, s.accel_bias_walk
-    )
     problem = InertialAdjustment(
         path.camera,
         tracks,
         _seconds(path)[keyframes] + late_s,
         Readings(
-            1e-9 * np.array([x.time_ns for x in motion]), values[:, :3], values[:, 3:], densities
+            1e-9 * np.array([x.time_ns for x in motion]), values[:, :3], values[:, 3:], s.densities
         ),
         T_cam0_imu,
         _rig_prior(run, last),

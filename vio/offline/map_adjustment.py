@@ -96,7 +96,13 @@ def _adjusted(
         np.searchsorted(keyframes, rows, side="right") - 1, return_inverse=True
     )
     run = InertialRun(
-        path, result.estimates.rows, result.motion_samples, T_cam0_body, field, result.config.msckf
+        path,
+        result.estimates.rows,
+        result.motion_samples,
+        T_cam0_body,
+        field,
+        result.config.msckf,
+        result.config.imu,
     )
 
     def go_on() -> None:

@@ -158,7 +158,9 @@ def _adjusted_with_imu(run: SavedRun, keyframes: IntArray) -> Adjustment:
     path = run.tracked
     known = read_estimates(path.where / RunFile.ESTIMATES)
     settings = _estimator_settings(path.where / "config.yaml")
-    taken = InertialRun(path, known, run.dataset.motion, run.T_cam0_imu, run.field, settings.msckf)
+    taken = InertialRun(
+        path, known, run.dataset.motion, run.T_cam0_imu, run.field, settings.msckf, settings.imu
+    )
     done = adjust_with_imu(taken, keyframes)
     T = path.trajectory.T_world_body[keyframes], done.T_world_cam0
     before, after = (

@@ -24,6 +24,7 @@ from vio.errors import DataError
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, ImuTerms, calibrated, term_sigmas
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
+from vio.imu.settings import DEFAULT_IMU
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
 from vio.targets.imu_checks import check_imu
@@ -99,7 +100,7 @@ def calibrate_imu(
     poses: BoardPoses,
     imu: ImuRecord,
     densities: ImuDensities,
-    gravity_mps2: float = 9.81,
+    gravity_mps2: float = DEFAULT_IMU.gravity_mps2,
     terms: ImuTerms = "off",
 ) -> CameraImu:
     """Calibrate a camera and an IMU.
