@@ -106,7 +106,6 @@ class FrameValidator:
                 "after "
                 f"{self._time_ns} ns); sort the frames by time"
             )
-        expected = (self.camera.height, self.camera.width)
         for name, image in images.items():
             if (
                 not isinstance(image, np.ndarray)
@@ -114,33 +113,32 @@ class FrameValidator:
                 or image.dtype != np.uint8
                 or not image.size
             ):
-                found = (
-                    f"has shape {image.shape} and type {image.dtype}"
-                    if isinstance(image, np.ndarray)
-                    else "is none"
-                )
                 raise DataError(
-                    f"frame {frame.index}: the {name} image {found}; "
+                    f"frame {frame.index}: the {name} image {_described(image)}; "
                     f"the {self.name} front end needs 8-bit gray images: read them with "
                     "vio.datasets.images.load_gray"
                 )
-            size = image.shape
-            if None not in expected and size != expected:
-                raise DataError(
-                    f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, but the "
-                    "calibration is for "
-                    f"{self.camera.width}x{self.camera.height}; check that calibration and images "
-                    "belong together"
-                )
-            if size != images["left"].shape or (self._shape is not None and size != self._shape):
-                raise DataError(
-                    f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, unlike the "
-                    "previous images; "
-                    "all images of a recording must have one size"
-                )
+            self._check_size(frame.index, name, image.shape, images["left"].shape)
         self._index = frame.index
         self._time_ns = frame.time_ns
         self._shape = images["left"].shape
+
+    def _check_size(
+        self, index: int, name: str, size: tuple[int, ...], left: tuple[int, ...]
+    ) -> None:
+        """Check an image's size (height, width) by the calibration, the left and the last image."""
+        expected = (self.camera.height, self.camera.width)
+        if None not in expected and size != expected:
+            raise DataError(
+                f"frame {index}: the {name} image is {size[1]}x{size[0]}, but the "
+                f"calibration is for {self.camera.width}x{self.camera.height}; check that "
+                "calibration and images belong together"
+            )
+        if size != left or (self._shape is not None and size != self._shape):
+            raise DataError(
+                f"frame {index}: the {name} image is {size[1]}x{size[0]}, unlike the "
+                "previous images; all images of a recording must have one size"
+            )
 
 
 class Features(Protocol):
@@ -199,3 +197,9 @@ def make_output(
         stages_ms=watch.stages_ms,
         findings=findings,
     )
+
+
+def _described(image: object) -> str:
+    if not isinstance(image, np.ndarray):
+        return "is none"
+    return f"has shape {image.shape} and type {image.dtype}"

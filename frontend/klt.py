@@ -304,8 +304,7 @@ class KltFrontend:
         stereo.forget_offset()
         previous = self._previous
         if previous is None or len(previous.tracks) == 0:
-            if prior is None or prior.measured_motion is None:
-                self._right.try_again(frame.index)
+            self._try_right_again(frame.index, prior)
             return no_tracks(), None
         old = previous.tracks
         levels = self._settings.pyramid_levels
@@ -372,6 +371,11 @@ class KltFrontend:
             return False
         gap_ns = frame.time_ns - self._previous.time_ns
         return gap_ns > max(_LONG_GAP_S * 1e9, _LONG_GAP_STEPS * self._step_ns)
+
+    def _try_right_again(self, index: int, prior: TrackPrior | None) -> None:
+        """Take the right image anew where nothing is tracked, as it was not at fault perhaps."""
+        if prior is None or prior.measured_motion is None:
+            self._right.try_again(index)
 
     def _reject_outliers(
         self,

@@ -159,6 +159,15 @@ class _Steps(NamedTuple):
     converged: float  # a motion is done when no entry of it changes by this
 
 
+class _Normal(NamedTuple):
+    """Normal equations of a twist, of which the first F entries are estimated."""
+
+    A: FloatArray  # (F, F), lower triangle
+    xi: FloatArray  # (6,) their vector, then the step
+    u_D_xi: FloatArray  # (6,) room for the Jacobian of a pixel's column
+    v_D_xi: FloatArray  # (6,) and row
+
+
 @compiled
 def _pixel_D_twist(
     camera: CameraArgs,
@@ -213,67 +222,90 @@ def _move_to(T: FloatArray, moved: FloatArray) -> float:
 
 
 @compiled
+def _clear(normal: _Normal) -> None:
+    """Write zeros into normal equations."""
+    for i in range(6):
+        normal.xi[i] = 0.0
+    for i in range(len(normal.A)):
+        for j in range(i + 1):
+            normal.A[i, j] = 0.0
+
+
+@compiled
+def _add_points(
+    camera: CameraArgs, T: FloatArray, seen: _Seen, h: int, scale_px: float, normal: _Normal
+) -> None:
+    """Add what the points of hypothesis h say of its motion (4, 4) to normal equations."""
+    fu, fv, cu, cv, _, _ = camera
+    points = seen.points
+    pixels = seen.pixels
+    A = normal.A
+    xi = normal.xi
+    u_D_xi = normal.u_D_xi
+    v_D_xi = normal.v_D_xi
+    for n in range(points.shape[1]):
+        px = points[h, n, 0]
+        py = points[h, n, 1]
+        pz = points[h, n, 2]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        azimuth, s, c, y, z = turn_to(camera, y, z)
+        w2 = seen.weight[h, n] ** 2
+        if not z > _MIN_DEPTH_M or w2 == 0.0:
+            continue
+        a = x / z
+        b = y / z
+        du = pixels[h, n, 0] - fu * a - cu
+        dv = pixels[h, n, 1] - fv * b - cv - fv * azimuth
+        u = fu * x / z + cu
+        v = fv * y / z + fv * azimuth + cv
+        # as `_distances`
+        error = np.sqrt((u - pixels[h, n, 0]) ** 2 + (v - pixels[h, n, 1]) ** 2)
+        if not error < 3.0 * scale_px:
+            continue
+        robust = 1.0 / (1.0 + (error / scale_px) ** 2)
+        w2 *= robust * robust
+        _pixel_D_twist(camera, (a, b, z), (azimuth, s, c), u_D_xi, v_D_xi)
+        for i in range(len(A)):
+            xi[i] += w2 * (u_D_xi[i] * du + v_D_xi[i] * dv)
+            for j in range(i + 1):
+                A[i, j] += w2 * (u_D_xi[i] * u_D_xi[j] + v_D_xi[i] * v_D_xi[j])
+
+
+@compiled
+def _solve(normal: _Normal) -> None:
+    """Replace the vector of normal equations by their damped and limited step."""
+    A = normal.A
+    xi = normal.xi
+    free = len(A)
+    trace = 0.0
+    for i in range(free):
+        trace += A[i, i]
+    for i in range(free):
+        A[i, i] += _CONSENSUS.damping * trace / free + 1e-9
+    solve_positive(A, xi)
+    for i in range(free):
+        xi[i] = min(max(xi[i], -5.0), 5.0)
+
+
+@compiled
 def _iterate(camera: CameraArgs, T: FloatArray, seen: _Seen, steps: _Steps) -> None:
     """Gauss-Newton on the first entries of the twists of motions (H, 4, 4), in place; see
     `_gauss_newton`.
     """
-    fu, fv, cu, cv, _, _ = camera
-    points = seen.points
-    pixels = seen.pixels
-    scale_px = steps.scale_px
     free = steps.free
-    A = np.empty((free, free))
-    xi = np.empty(6)
-    u_D_xi = np.empty(6)
-    v_D_xi = np.empty(6)
+    normal = _Normal(np.empty((free, free)), np.empty(6), np.empty(6), np.empty(6))
     moved = np.empty((4, 4))
     for h in range(len(T)):
         for _ in range(steps.iterations):
-            for i in range(6):
-                xi[i] = 0.0
-            for i in range(free):
-                for j in range(i + 1):
-                    A[i, j] = 0.0
-            for n in range(points.shape[1]):
-                px = points[h, n, 0]
-                py = points[h, n, 1]
-                pz = points[h, n, 2]
-                x = T[h, 0, 0] * px + T[h, 0, 1] * py + T[h, 0, 2] * pz + T[h, 0, 3]
-                y = T[h, 1, 0] * px + T[h, 1, 1] * py + T[h, 1, 2] * pz + T[h, 1, 3]
-                z = T[h, 2, 0] * px + T[h, 2, 1] * py + T[h, 2, 2] * pz + T[h, 2, 3]
-                azimuth, s, c, y, z = turn_to(camera, y, z)
-                w2 = seen.weight[h, n] ** 2
-                if not z > _MIN_DEPTH_M or w2 == 0.0:
-                    continue
-                a = x / z
-                b = y / z
-                du = pixels[h, n, 0] - fu * a - cu
-                dv = pixels[h, n, 1] - fv * b - cv - fv * azimuth
-                u = fu * x / z + cu
-                v = fv * y / z + fv * azimuth + cv
-                # as `_distances`
-                error = np.sqrt((u - pixels[h, n, 0]) ** 2 + (v - pixels[h, n, 1]) ** 2)
-                if not error < 3.0 * scale_px:
-                    continue
-                robust = 1.0 / (1.0 + (error / scale_px) ** 2)
-                w2 *= robust * robust
-                _pixel_D_twist(camera, (a, b, z), (azimuth, s, c), u_D_xi, v_D_xi)
-                for i in range(free):
-                    xi[i] += w2 * (u_D_xi[i] * du + v_D_xi[i] * dv)
-                    for j in range(i + 1):
-                        A[i, j] += w2 * (u_D_xi[i] * u_D_xi[j] + v_D_xi[i] * v_D_xi[j])
-            trace = 0.0
-            for i in range(free):
-                trace += A[i, i]
-            for i in range(free):
-                A[i, i] += _CONSENSUS.damping * trace / free + 1e-9
-            solve_positive(A, xi)
-            for i in range(free):
-                xi[i] = min(max(xi[i], -5.0), 5.0)
+            _clear(normal)
+            _add_points(camera, T[h], seen, h, steps.scale_px, normal)
+            _solve(normal)
             for i in range(4):
                 for j in range(4):
                     moved[i, j] = T[h, i, j]
-            move_by_twist(xi, moved)
+            move_by_twist(normal.xi, moved)
             if _move_to(T[h], moved) < steps.converged:
                 break
 

@@ -20,6 +20,10 @@ _NEIGHBOURS = 3  # matched features whose median depth replaces an unknown one
 _FAR_M = 1e6  # depth assumed where too few features have one
 
 
+def _is_rotation(R: FloatArray) -> bool:
+    return bool(np.isfinite(R).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_SLACK)
+
+
 def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
     """Return the valid part of a prior: finite left pixels, one row per id, and the rotation if
     it is orthonormal.
@@ -33,9 +37,7 @@ def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
         z = z[first]
     finite = np.isfinite(z[:, :2]).all(axis=1)
     R = prior.R_cam_prev
-    if R is not None and not (
-        np.isfinite(R).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_SLACK
-    ):
+    if R is not None and not _is_rotation(R):
         R = None
     if R is None and not finite.any():
         return None

@@ -102,11 +102,17 @@ class RightCamera(Finder):
             return False
         tested = moved and len(matched) >= _MIN_POINTS
         share = share_of(matched) if len(matched) else 0.0
-        if not self._contradicts:
-            if tested and share < _CONTRADICTS:
-                self._begin(index)
-            return not self._contradicts
-        agrees = moved and len(matched) >= _MIN_AGREEING and share >= _AGREES
+        if self._contradicts:
+            agrees = moved and len(matched) >= _MIN_AGREEING and share >= _AGREES
+            self._count_agreement(index, tested=tested, agrees=agrees)
+        elif tested and share < _CONTRADICTS:
+            self._begin(index)
+        return not self._contradicts
+
+    def _count_agreement(self, index: int, *, tested: bool, agrees: bool) -> None:
+        """Use right images again once they agree, or were not tested, for so many frames; report
+        those that contradict for so many.
+        """
         self._untested = 0 if tested or agrees else self._untested + 1
         self._agreeing = self._agreeing + 1 if agrees else 0
         self._count += not agrees
@@ -117,7 +123,6 @@ class RightCamera(Finder):
             )
         elif self._count >= _FRAMES:
             self._report(index)
-        return not self._contradicts
 
     def try_again(self, index: int) -> None:
         """Use right images again that contradicted depths of which none is left, where no sensor

@@ -126,8 +126,7 @@ class RightDelay(Finder):
         delay, sigma, explained = self._significance()
         if _SIGMAS * sigma > _MIN_DELAY:
             return
-        whole = float(np.rint(delay))
-        rounded = whole if abs(delay - whole) < _WHOLE else delay
+        rounded = _rounded(delay)
         if self.frames != 0.0:
             if abs(delay) < _FORGET:
                 self._end(index)
@@ -263,3 +262,9 @@ def at_present(
         ),
         has_point=tracks.has_point | matched,
     )
+
+
+def _rounded(delay: float) -> float:
+    """Return a delay in frames, a whole number where it is close to one."""
+    whole = float(np.rint(delay))
+    return whole if abs(delay - whole) < _WHOLE else delay

@@ -17,7 +17,7 @@ from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import IntArray, StereoFrame, TrackPrior
+from vio.records import BoolArray, IntArray, StereoFrame, TrackPrior
 
 _NEARLY_ALL = 0.9  # of the matches without an offset, that one with it may have
 _PAIRING_POINTS = 150  # features that are tried with images of other frames
@@ -76,24 +76,10 @@ class RightMatcher:
         tested = motion is not None and not stereo.has_few_matches
         if delay == 0.0:
             matched = stereo.track_right(tracks, right, motion is not None)
-            few = self._right.doubts(matched.has_right[testable])
-            common_px = stereo.common_px
-            self.shake.frame(frame.index, common_px, int(matched.has_right.sum()))
-            # one that stays may be too small to lose matches by
-            if tested and (few or self.turn.may_stay or self.turn.is_jump(common_px)):
-                off = stereo.track_off_right(tracks, left, right, by_motion=not self._right.usable)
-                least = matched.has_right.sum() * (1.0 if few else _NEARLY_ALL)
-                if off.has_right.sum() > least and self.turn.is_offset(stereo.offset_px):
-                    matched = off
-                else:
-                    stereo.forget_offset()
-            turn_px = self.turn.frame(frame.index, stereo.offset_px)
-            if turn_px is not None:
-                stereo.take_out(turn_px)
+            matched = self._take_turn(images, right, tracks, matched, testable, tested=tested)
         else:
             self.shake.explained(frame.index)
-            T = np.eye(4) if prior is None or prior.motion is None else prior.motion.T_curr_prev
-            T = T if motion is None else motion.T_curr_prev
+            T = _motion_between(prior, motion)
             matched = self._match_delayed(previous, tracks, right, flow, T, stereo)
         frame_s = (frame.time_ns - previous.time_ns) * 1e-9
         if not self._right.check_matches(frame.index, matched.has_right[testable], moved=tested):
@@ -109,6 +95,39 @@ class RightMatcher:
         if self._delay.update(frame.index, matched.left[seen], flow[seen], rows, frame_s):
             stereo.restart_rows()
             return no_tracks()  # their depths are those of images of different times
+        return matched
+
+    def _take_turn(
+        self,
+        images: FrameImages,
+        right: ImageLevels,
+        tracks: Tracks,
+        matched: Tracks,
+        testable: BoolArray,
+        *,
+        tested: bool,
+    ) -> Tracks:
+        """Return the matches of a frame, of a right image whose rows are off where more are found
+        so; then the right camera has turned, or shakes.
+        """
+        index = images.frame.index
+        stereo = images.stereo
+        few = self._right.doubts(matched.has_right[testable])
+        common_px = stereo.common_px
+        self.shake.frame(index, common_px, int(matched.has_right.sum()))
+        # one that stays may be too small to lose matches by
+        if tested and (few or self.turn.may_stay or self.turn.is_jump(common_px)):
+            off = stereo.track_off_right(
+                tracks, images.left, right, by_motion=not self._right.usable
+            )
+            least = matched.has_right.sum() * (1.0 if few else _NEARLY_ALL)
+            if off.has_right.sum() > least and self.turn.is_offset(stereo.offset_px):
+                matched = off
+            else:
+                stereo.forget_offset()
+        turn_px = self.turn.frame(index, stereo.offset_px)
+        if turn_px is not None:
+            stereo.take_out(turn_px)
         return matched
 
     def _count_pairings(
@@ -169,3 +188,10 @@ def _rows_by_slot(old: Tracks, now: Tracks) -> IntArray:
     rows = np.empty(old.slot.max(initial=-1) + 1, dtype=np.int64)
     rows[old.slot] = np.arange(len(old))
     return rows[now.slot]
+
+
+def _motion_between(prior: TrackPrior | None, motion: Consensus | None) -> FloatArray:
+    """Return the motion (4, 4) by the images, else as predicted, else none."""
+    if motion is not None:
+        return motion.T_curr_prev
+    return np.eye(4) if prior is None or prior.motion is None else prior.motion.T_curr_prev

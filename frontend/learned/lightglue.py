@@ -58,6 +58,20 @@ class _LightGlueMatcher:
         return np.asarray(pairs[allowed[pairs[:, 0], pairs[:, 1]]], dtype=np.int64)
 
 
+def _check_detector(learned: LearnedSettings) -> None:
+    if learned.detector not in _DETECTORS:
+        raise ConfigError(
+            f"{SECTION}.matcher is lightglue, which goes with the detectors "
+            f"{', '.join(_DETECTORS)} here, not with "
+            f"{learned.detector}; set matcher to nearest"
+        )
+    if learned.detector == "aliked" and learned.aliked_model == "aliked-t16":
+        raise ConfigError(
+            f"{SECTION}.matcher is lightglue, which takes ALIKED's descriptors of 128 numbers, but "
+            "aliked-t16 gives 64; set aliked_model to aliked-n16, with its weights"
+        )
+
+
 def build_lightglue(
     learned: LearnedSettings, camera: StereoCamera, device: torch.device
 ) -> Matcher:
@@ -69,18 +83,8 @@ def build_lightglue(
     """
     import kornia.feature as kf
 
-    if learned.detector not in _DETECTORS:
-        raise ConfigError(
-            f"{SECTION}.matcher is lightglue, which goes with the detectors "
-            f"{', '.join(_DETECTORS)} here, not with "
-            f"{learned.detector}; set matcher to nearest"
-        )
+    _check_detector(learned)
     options = dict(kf.LightGlue.features[learned.detector])
-    if learned.detector == "aliked" and learned.aliked_model == "aliked-t16":
-        raise ConfigError(
-            f"{SECTION}.matcher is lightglue, which takes ALIKED's descriptors of 128 numbers, but "
-            "aliked-t16 gives 64; set aliked_model to aliked-n16, with its weights"
-        )
     network = kf.LightGlue(features=cast(Any, None), **(options | {"weights": None}))
     state = load_weights(learned.matcher_weights, "matcher_weights")
     state = {key.removeprefix("matcher."): value for key, value in state.items()}

@@ -99,19 +99,28 @@ def _fit_motions(
                     normal[i, j] = 0.0
             for m in range(begins[k], begins[k + 1]):
                 _add_point(camera, p[m], z[m], width * width, T[k], normal, xi)
-            trace = 0.0
             for i in range(6):
                 none[i] = 0.0
-                trace += normal[i, i]
-            for i in range(6):
-                for j in range(i + 1):
-                    shifted[i, j] = normal[i, j] - (_DEGENERATE * trace if i == j else 0.0)
+            _shift(normal, shifted)
             solve_positive(shifted, none)  # not a number where it is not positive
             if none[0] != 0.0:
                 determined[k] = False
                 break
             solve_positive(normal, xi)
             move_by_twist(xi, T[k])
+
+
+@compiled
+def _shift(normal: FloatArray, out: FloatArray) -> None:
+    """Write the lower triangle of normal equations (6, 6) less the share of their trace at which
+    they are degenerate.
+    """
+    trace = 0.0
+    for i in range(6):
+        trace += normal[i, i]
+    for i in range(6):
+        for j in range(i + 1):
+            out[i, j] = normal[i, j] - (_DEGENERATE * trace if i == j else 0.0)
 
 
 @compiled
@@ -143,9 +152,10 @@ def _add_point(
     r3 = z[3] - v - fv * azimuth - cv
     r2 = z[2] - (u - fu * baseline / depth) - cu
     weight = 1.0 / (1.0 + (r0 * r0 + r1 * r1 + r2 * r2 + r3 * r3) / width2) ** 2
+    residuals = (r0, r1, r2, r3)
     for a in range(4):
-        r = r0 if a == 0 else r1 if a == 1 else r2 if a == 2 else r3
-        if a == 0 or a == 2:
+        r = residuals[a]
+        if a % 2 == 0:
             across = u if a == 0 else u - fu * baseline / depth
             D[0] = fu / depth
             D[1] = -across * s / depth

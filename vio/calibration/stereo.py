@@ -108,6 +108,20 @@ def epipolar_spread(R_cam1_cam0: FloatArray, direction: FloatArray, matches: Ray
     return float(np.median(np.abs(epipolar_angles(R_cam1_cam0, direction, matches))))
 
 
+def _jackknife_sigmas(
+    inliers: RayMatches, R: FloatArray, direction: FloatArray, width: float
+) -> tuple[float, float]:
+    """Return the standard deviations of rotation and baseline direction, by fits that leave out one
+    block of pairs each.
+    """
+    refits = [
+        _fit_stereo(inliers.take(~block), R, direction, width) for block in _blocks(inliers.pair)
+    ]
+    turns = np.array([so3_log(Rk @ R.T) for Rk, _ in refits])
+    swings = np.array([np.cross(direction, dk) for _, dk in refits])
+    return _jackknife_norm(turns), _jackknife_norm(swings)
+
+
 def refine_stereo(
     matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray
 ) -> StereoEstimate | NotObservable:
@@ -131,13 +145,7 @@ def refine_stereo(
             return few
         R, d = _fit_stereo(inliers, R, d, max(spread, 1e-6))
     spread = robust_sigma(epipolar_angles(R, d, inliers))
-    refits = [
-        _fit_stereo(inliers.take(~block), R, d, max(spread, 1e-6))
-        for block in _blocks(inliers.pair)
-    ]
-    turns = np.array([so3_log(Rk @ R.T) for Rk, _ in refits])
-    swings = np.array([np.cross(d, dk) for _, dk in refits])
-    rotation_sigma, direction_sigma = (_jackknife_norm(v) for v in (turns, swings))
+    rotation_sigma, direction_sigma = _jackknife_sigmas(inliers, R, d, max(spread, 1e-6))
     if rotation_sigma > np.radians(_FIT.stereo_rotation_deg) or direction_sigma > np.radians(
         _FIT.stereo_direction_deg
     ):

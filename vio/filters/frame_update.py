@@ -7,6 +7,8 @@ clone. Tracks that continue are linearised anew in every frame and absorbed into
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.cameras.rectification_error import CONSIDERED, ErrorColumns
@@ -101,6 +103,25 @@ class _UpdateRules:
 _UPDATE = _UpdateRules()
 
 
+class _Predicted(NamedTuple):
+    """A frame as it was predicted."""
+
+    tracks: LinearTracks  # at the predicted pose
+    T_world_imu: FloatArray  # (4, 4) predicted pose of the body
+    covariance: FloatArray  # (6, 6) of the camera's motion since the last frame
+    innovation: float | None  # of the newest pixels, median
+    innovation_ratio: float | None  # over their standard deviation, median
+
+
+class _Fitted(NamedTuple):
+    """A fit to a frame."""
+
+    tracks: LinearTracks
+    fit: Fit
+    pixels: Views  # of the landmarks
+    trusted: bool  # whether the step's errors are those of the motion sensor
+
+
 class FrameUpdate:
     """Updates a window with what a frame shows."""
 
@@ -178,50 +199,30 @@ class FrameUpdate:
         self._rig.learn_rows(window, seen)
         self._rig.end_frame(window, seen)
         propagation = self._propagation
-        rows, found = rows_of(seen, window.landmark_ids)
-        self._keep_landmarks(window, found)
-        pixels = Views(seen.z[rows], precision(seen)[rows])
-        of_tracks = np.ones(len(seen), dtype=np.bool_)
-        of_tracks[rows] = False
-        self.tracks.table.add_frame(len(window.clones) - 1, seen.take(of_tracks))
-
-        predicted = window.camera_move_since(-2) if len(window.clones) > 1 else None
-        T_world_predicted = window.nav.T_world_imu
-        rows = self.tracks.choose(len(window.clones))
-        tracks = self._linearise(window, rows, _UPDATE.first_steps)
-        if not self._is_measured and self._is_lost(window, tracks, len(rows), pixels):
-            self._begin_by_images(window, rows, pixels)
-            tracks = self._linearise(window, rows, _UPDATE.first_steps)
-        at_prediction = tracks
+        pixels = self._take_pixels(window, seen)
+        motion = window.camera_move_since(-2) if len(window.clones) > 1 else None
+        T_world_imu = window.nav.T_world_imu
+        tracks = self._linearise_prediction(window, pixels)
         innovation = tracks.newest_innovation()
         innovation_ratio = self.tracks.innovation_ratio(tracks, expected)
+        predicted = _Predicted(tracks, T_world_imu, expected, innovation, innovation_ratio)
         tracks, fitted = self._fit(window, tracks, pixels, innovation)
-        step = self._step_errors(window, tracks, predicted, fitted, expected)
+        step = self._step_errors(window, tracks, motion, fitted, expected)
         jump_radps = None
         if step is not None:
             missing = step.missing_noise()
-            doubted = False
-            turn = None
-            contradicted = (innovation_ratio or 0.0) > _UPDATE.contradicted
-            off = bool(missing[1]) or contradicted
-            settled = self._gyro_jump.is_settled(off=off)
-            if off and self._has_imu and settled:
-                turn = turn_of_images(at_prediction, expected, T_world_predicted)
+            turn = self._turn_against_gyro(predicted, missing)
             if turn is None:
                 jump_radps = self._gyro_jump.agrees(window.nav.gyro_bias)
+            trusted = True
             if turn is not None and self._doubts_gyro(window, turn, tracks):
-                doubted = True
+                trusted = False
                 tracks, fitted = self._fit(window, tracks, pixels, innovation)
-            elif missing.any() and self.tracks.agree(tracks.at):
-                window.inflate_process_noise(
-                    np.einsum("k,kij->ij", missing, propagation.since_frame.Q_parts)
-                )
-                tracks, fitted = self._fit(window, tracks, pixels, innovation)
-            elif missing.any() and self._has_imu:
-                doubted = self.tracks.drop_unpredicted(at_prediction, expected)
-                pixels = Views(pixels.z, np.zeros_like(pixels.weight))
-                tracks, fitted = self._fit_again(window, pixels)
-            if not (propagation.since_frame.bridged or doubted):
+            elif missing.any():
+                first = _Fitted(tracks, fitted, pixels, trusted)
+                again = self._fit_without_prediction(window, first, predicted, missing)
+                tracks, fitted, pixels, trusted = again
+            if trusted and not propagation.since_frame.bridged:
                 propagation.noise.update(step)
         propagation.since_frame = NO_STEP
 
@@ -246,6 +247,54 @@ class FrameUpdate:
             gyro_jump_radps=jump_radps,
             scale_doubt=self._rig.scale_doubt(window),
         )
+
+    def _take_pixels(self, window: Window, seen: Observations) -> Views:
+        """Give the tracks what a frame shows of them; return what it shows of the landmarks, of
+        which those that it does not show leave the state.
+        """
+        rows, found = rows_of(seen, window.landmark_ids)
+        self._keep_landmarks(window, found)
+        of_tracks = np.ones(len(seen), dtype=np.bool_)
+        of_tracks[rows] = False
+        self.tracks.table.add_frame(len(window.clones) - 1, seen.take(of_tracks))
+        return Views(seen.z[rows], precision(seen)[rows])
+
+    def _linearise_prediction(self, window: Window, pixels: Views) -> LinearTracks:
+        """Linearise the tracks at the predicted pose, or, where that is lost, at one by images."""
+        rows = self.tracks.choose(len(window.clones))
+        tracks = self._linearise(window, rows, _UPDATE.first_steps)
+        if self._is_measured or not self._is_lost(window, tracks, len(rows), pixels):
+            return tracks
+        self._begin_by_images(window, rows, pixels)
+        return self._linearise(window, rows, _UPDATE.first_steps)
+
+    def _turn_against_gyro(self, predicted: _Predicted, missing: FloatArray) -> FloatArray | None:
+        """Return the rotation (3,) by which the images contradict a gyro that is off, as noise (2,)
+        that its prediction lacks shows, or the innovations; None: they do not, or there is none.
+        """
+        contradicted = (predicted.innovation_ratio or 0.0) > _UPDATE.contradicted
+        off = bool(missing[1]) or contradicted
+        settled = self._gyro_jump.is_settled(off=off)
+        if not off or not self._has_imu or not settled:
+            return None
+        return turn_of_images(predicted.tracks, predicted.covariance, predicted.T_world_imu)
+
+    def _fit_without_prediction(
+        self, window: Window, first: _Fitted, predicted: _Predicted, missing: FloatArray
+    ) -> _Fitted:
+        """Fit again where the prediction's noise (2,) is too small: with more of it if the tracks
+        agree with one another, else without the features that the IMU did not predict.
+        """
+        if self.tracks.agree(first.tracks.at):
+            growth = self._propagation.since_frame.Q_parts
+            window.inflate_process_noise(np.einsum("k,kij->ij", missing, growth))
+            again = self._fit(window, first.tracks, first.pixels, predicted.innovation)
+            return _Fitted(*again, first.pixels, True)
+        if not self._has_imu:
+            return first
+        doubted = self.tracks.drop_unpredicted(predicted.tracks, predicted.covariance)
+        pixels = Views(first.pixels.z, np.zeros_like(first.pixels.weight))
+        return _Fitted(*self._fit_again(window, pixels), pixels, not doubted)
 
     def _doubts_gyro(self, window: Window, turn: FloatArray, tracks: LinearTracks) -> bool:
         """Whether the newest step contradicts the gyro by a rotation (3,) that inflated noise of

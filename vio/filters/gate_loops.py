@@ -20,7 +20,7 @@ def _inverse_factor(B: FloatArray, first: int, scale: float, V: FloatArray) -> b
         Whether they are positive.
     """
     L = np.empty((3, 3))
-    for i in range(3):  # L L' = B, and the rows of V are the inverse of L
+    for i in range(3):  # L L' = B
         for j in range(i + 1):
             total = B[first + i, first + j] + (1e-12 * scale if i == j else 0.0)
             for k in range(j):
@@ -28,12 +28,35 @@ def _inverse_factor(B: FloatArray, first: int, scale: float, V: FloatArray) -> b
             if i == j and not total > 0.0:
                 return False
             L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
+    _invert_factor(L, V)
+    return True
+
+
+@compiled
+def _invert_factor(L: FloatArray, V: FloatArray) -> None:
+    """Write the inverse of a lower triangle (3, 3)."""
+    for i in range(3):
         for j in range(3):
             total = 1.0 if i == j else 0.0
             for k in range(i):
                 total -= L[i, k] * V[k, j]
             V[i, j] = total / L[i, i]
-    return True
+
+
+@compiled
+def _whiten_removed(
+    expected: FloatArray, remaining: FloatArray, first: int, V: FloatArray, M: FloatArray
+) -> None:
+    """Write the covariance that a correction removed of three rows, in the units of the expected
+    one, whose inverse factor (3, 3) is given.
+    """
+    for i in range(3):
+        for j in range(3):
+            M[i, j] = 0.0
+            for k in range(3):
+                for m in range(3):
+                    removed = expected[first + k, first + m] - remaining[first + k, first + m]
+                    M[i, j] += V[i, k] * removed * V[j, m]
 
 
 @compiled
@@ -57,13 +80,7 @@ def whiten_correction(
     V = np.empty((3, 3))
     if not _inverse_factor(expected, first, scale, V):
         return np.nan, 0, 0.0
-    for i in range(3):
-        for j in range(3):
-            M[i, j] = 0.0
-            for k in range(3):
-                for m in range(3):
-                    removed = expected[first + k, first + m] - remaining[first + k, first + m]
-                    M[i, j] += V[i, k] * removed * V[j, m]
+    _whiten_removed(expected, remaining, first, V, M)
     U = np.empty((3, 3))
     row = np.empty(3)
     eigenvectors(M, U)

@@ -37,6 +37,19 @@ class ImuStart:
     accel_sigma_mps2: float  # standard deviation of the mean acceleration, horizontal, per axis
 
 
+def _recent(
+    samples: Sequence[ImuSample], time_ns: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return times (S,) in seconds up to the last of the samples before a time, and their gyro and
+    accelerometer, (S, 3) each, of the last half second.
+    """
+    before = [x for x in samples if x.time_ns <= time_ns] or list(samples[:1])
+    last_ns = before[-1].time_ns
+    recent = [x for x in before if x.time_ns >= last_ns - STANDSTILL_S * 1e9]
+    times_s = np.array([x.time_ns - last_ns for x in recent]) * 1e-9
+    return times_s, np.array([x.gyro for x in recent]), np.array([x.accel for x in recent])
+
+
 def imu_start(samples: Sequence[ImuSample], time_ns: int, imu: ImuSettings) -> ImuStart:
     """Judge the last half second of samples before a time.
 
@@ -48,17 +61,13 @@ def imu_start(samples: Sequence[ImuSample], time_ns: int, imu: ImuSettings) -> I
     Raises:
         EstimationError: the accelerometer reads nothing.
     """
-    before = [x for x in samples if x.time_ns <= time_ns] or list(samples[:1])
-    recent = [x for x in before if x.time_ns >= before[-1].time_ns - STANDSTILL_S * 1e9]
-    times_s = np.array([x.time_ns - before[-1].time_ns for x in recent]) * 1e-9
-    gyro = np.array([x.gyro for x in recent])
-    accel = np.array([x.accel for x in recent])
+    times_s, gyro, accel = _recent(samples, time_ns)
     force = np.mean(_turned_to_the_last(times_s, gyro, accel), axis=0)
     length = float(np.linalg.norm(force))
     if length < 1e-3:
         raise EstimationError("the accelerometer reads zero; is it in m/s^2, with gravity in it?")
     s = imu
-    span_s = max(-float(times_s[0]), 1e-3) if len(recent) > 1 else 5e-3
+    span_s = max(-float(times_s[0]), 1e-3) if len(times_s) > 1 else 5e-3
     force_noise, rate_noise = (
         d / np.sqrt(span_s) for d in (s.accel_noise_density, s.gyro_noise_density)
     )
@@ -68,14 +77,12 @@ def imu_start(samples: Sequence[ImuSample], time_ns: int, imu: ImuSettings) -> I
     still = blocks_agree(times_s, gyro, s.gyro_noise_density) and blocks_agree(
         times_s, accel, s.accel_noise_density
     )
-    still = (
-        still and abs(length - s.gravity_mps2) < tolerance and turn < 3 * s.gyro_bias_sigma_radps
-    )
+    agrees = abs(length - s.gravity_mps2) < tolerance and turn < 3 * s.gyro_bias_sigma_radps
     # |f|^2 = g^2 + a^2 where the acceleration is level; what noise alone makes of |f|^2 - g^2 is no
     # evidence.
     level = abs(length**2 - s.gravity_mps2**2) - 4 * s.gravity_mps2 * force_noise
     shown = np.sqrt(max(level, 0.0))
-    if still:
+    if still and agrees:
         # The whole reading may be a turn, so the bias is known to its size.
         bias_sigma = float(np.hypot(turn, NOISE_FACTOR * rate_noise))
         return ImuStart(

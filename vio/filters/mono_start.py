@@ -35,7 +35,7 @@ from vio.filters.navigation import (
     NavState,
 )
 from vio.filters.online_calibration import Calibration
-from vio.filters.prior import Prior
+from vio.filters.prior import Fit, Prior
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import eliminate_points
 from vio.filters.window import Window
@@ -261,29 +261,10 @@ class MonoStarter:
         """
         for attempt in range(2):  # the second time linearised at the result of the first
             window = self._window(motion, views, begin)
-            tracks.table.has_point[:] = False
-            fitted = None
-            for _ in range(_START.steps):
-                lin = tracks.linearise(window.T_cam0_world(), tracks.choose(len(views)), 2)
-                if len(lin.rows) < _START.min_tracks:
-                    self.why = f"only {len(lin.rows)} features show parallax"
-                    return None
-                self._follow_noise(tracks, lin)
-                A, b = eliminate_points(lin.information, np.ones(len(lin.rows), dtype=np.bool_))
-                A, b, _ = window.state.information(A, b, tracks.variance)
-                try:
-                    fitted, error = window.optimum(A, b, len(A))
-                except np.linalg.LinAlgError:
-                    return None
-                tracks.move_points(
-                    lin, lin.stereo, error[window.state.clones], error[window.state.stereo]
-                )
-                window.relinearise(error)
-                if np.abs(error).max() < _START.converged:
-                    break
-            else:
-                self.why = "features and IMU do not agree on one motion"
+            solved = self._solve(window, len(views), tracks)
+            if solved is None:
                 return None
+            fitted, lin = solved
             if attempt == 0:
                 passed, _, _ = tracks.gate(lin.at)
                 tracks.table.remove(lin.rows[~passed])  # they are on what moves
@@ -294,7 +275,6 @@ class MonoStarter:
                     velocity=first.velocity,
                     gyro_bias=window.nav.gyro_bias,
                 )
-        assert fitted is not None
         if tracks.variance >= self._settings.pixel_sigma_max_px**2:
             self.why = (
                 f"features and IMU disagree by more than {self._settings.pixel_sigma_max_px:g} px"
@@ -313,6 +293,34 @@ class MonoStarter:
         P = excess * fitted.covariance()
         sigma = scale_sigma(WindowPosterior.of(window, P))
         return *_at_origin(window.nav, P[:DIM, :DIM]), float("inf") if sigma is None else sigma
+
+    def _solve(
+        self, window: Window, views: int, tracks: WindowTracks
+    ) -> tuple[Fit, LinearTracks] | None:
+        """Gauss-Newton over a window of so many views; return the fit and the tracks that it was
+        made from.
+        """
+        tracks.table.has_point[:] = False
+        for _ in range(_START.steps):
+            lin = tracks.linearise(window.T_cam0_world(), tracks.choose(views), 2)
+            if len(lin.rows) < _START.min_tracks:
+                self.why = f"only {len(lin.rows)} features show parallax"
+                return None
+            self._follow_noise(tracks, lin)
+            A, b = eliminate_points(lin.information, np.ones(len(lin.rows), dtype=np.bool_))
+            A, b, _ = window.state.information(A, b, tracks.variance)
+            try:
+                fitted, error = window.optimum(A, b, len(A))
+            except np.linalg.LinAlgError:
+                return None
+            tracks.move_points(
+                lin, lin.stereo, error[window.state.clones], error[window.state.stereo]
+            )
+            window.relinearise(error)
+            if np.abs(error).max() < _START.converged:
+                return fitted, lin
+        self.why = "features and IMU do not agree on one motion"
+        return None
 
     def _window(self, motion: ImuMotion, views: list[Observations], begin: NavState) -> Window:
         """The window of all views, predicted from a first state, under the prior alone."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -65,6 +65,8 @@ from vio.records import (
 )
 
 _SAMPLES = {"imu": ImuSample, "velocity": VelocitySample}  # of each motion source
+# a camera's pose at a frame by the state, the body's, and the covariance of its noise
+_Exposure: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 _MAX_SPEED_MPS = 100.0  # with an IMU, whose scale is metric: beyond it the filter has diverged
 
 
@@ -192,47 +194,22 @@ class Msckf(Backend):
         seen = observations.take(~observations.stale)
         propagation = self._propagation
         if self._window is None:
-            start = self._start_state(seen)
-            if start is None:
-                return self._wait(observations)
-            nav, P = start
-            if self._source == "imu":
-                propagation.noise = self._first_noise(P)
-            self._window = self._first_window(nav, P, self._calibration)
-            state = self._window.state
-            if "imu_terms" in state and isinstance(propagation.motion, ImuMotion):
-                to_tilt = np.eye(state.size)
-                to_tilt[3:6, state["imu_terms"]] = propagation.motion.tilt_D_terms(nav)  # (A4)
-                self._window.prior.transform(to_tilt)
-            self._began_ns = observations.time_ns  # one camera begins anew after a divergence
-            self._tilted = np.eye(3)
-            propagation.begin(self._window, observations.time_ns, observations.time_ns)
-            self._measure()
-        elif len(seen) and propagation.is_lost and self._good is not None:
-            unseen_s = (observations.time_ns - self._good.time_ns) * 1e-9
-            raise DivergedError(
-                f"msckf has lost its way in {unseen_s:.1f} s without a feature or a motion sensor"
-            )
+            window = self._begin(observations, seen)
         else:
-            propagation.advance(self._window, observations.time_ns)
-        window = self._window
+            window = self._advance(self._window, observations, len(seen))
+        if window is None:
+            return self._wait(observations)
         if window.clones and not len(seen):
             # A frame that shows nothing ends no track; what is seen next decides.
             propagation.blind = True
-            if not _is_sane(window, self._source):
-                raise DivergedError(_lost(observations.frame_index))
+            _check_sane(window, self._source, observations.frame_index)
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         propagation.blind = False
         now = (window.nav, propagation.since_frame)
         late_s = propagation.late_s
         exposure, expected = propagation.exposure(window, *now, late_s)
-        # Half a window gives the velocity: before, its product with the offset's error would pass
-        # for knowledge of it.
-        moving = len(window.clones) >= self._settings.clones // 2
-        if "time_offset" in window.state and moving and not window.clocks_compared:
-            twist = propagation.twist(window, *now)
-            window.compare_clocks(observations.time_ns, late_s, twist)
-            exposure = window.camera_D_own(late_s, twist)
+        if "time_offset" in window.state and not window.clocks_compared:
+            exposure = self._compare_clocks(window, observations.time_ns, exposure)
         window.add_clone(observations.frame_index, observations.time_ns, exposure)
         self._keep_first_attitude(window)
         # the oldest that stays
@@ -243,8 +220,7 @@ class Msckf(Backend):
             self._keep_first_yaw(window, before)
         except np.linalg.LinAlgError as error:
             raise DivergedError(_lost(observations.frame_index)) from error
-        if not _is_sane(window, self._source):
-            raise DivergedError(_lost(observations.frame_index))
+        _check_sane(window, self._source, observations.frame_index)
         if report.used >= report.gated:
             self._good = GoodState(
                 observations.frame_index,
@@ -254,6 +230,52 @@ class Msckf(Backend):
                 window.calibration,
             )
         return report
+
+    def _begin(self, observations: Observations, seen: Observations) -> Window | None:
+        """Begin the state at a frame; None: the frame passes."""
+        start = self._start_state(seen)
+        if start is None:
+            return None
+        propagation = self._propagation
+        nav, P = start
+        if self._source == "imu":
+            propagation.noise = self._first_noise(P)
+        window = self._window = self._first_window(nav, P, self._calibration)
+        state = window.state
+        if "imu_terms" in state and isinstance(propagation.motion, ImuMotion):
+            to_tilt = np.eye(state.size)
+            to_tilt[3:6, state["imu_terms"]] = propagation.motion.tilt_D_terms(nav)  # (A4)
+            window.prior.transform(to_tilt)
+        self._began_ns = observations.time_ns  # one camera begins anew after a divergence
+        self._tilted = np.eye(3)
+        propagation.begin(window, observations.time_ns, observations.time_ns)
+        self._measure()
+        return window
+
+    def _advance(self, window: Window, observations: Observations, seen: int) -> Window:
+        """Propagate to a frame, which shows so many features."""
+        propagation = self._propagation
+        if seen and propagation.is_lost and self._good is not None:
+            unseen_s = (observations.time_ns - self._good.time_ns) * 1e-9
+            raise DivergedError(
+                f"msckf has lost its way in {unseen_s:.1f} s without a feature or a motion sensor"
+            )
+        propagation.advance(window, observations.time_ns)
+        return window
+
+    def _compare_clocks(self, window: Window, time_ns: int, exposure: _Exposure) -> _Exposure:
+        """Compare the clocks of camera and IMU at a frame; return its camera's Jacobian by the
+        state, then.
+        """
+        # Half a window gives the velocity: before, its product with the offset's error would pass
+        # for knowledge of it.
+        if len(window.clones) < self._settings.clones // 2:
+            return exposure
+        propagation = self._propagation
+        late_s = propagation.late_s
+        twist = propagation.twist(window, window.nav, propagation.since_frame)
+        window.compare_clocks(time_ns, late_s, twist)
+        return window.camera_D_own(late_s, twist)
 
     @property
     def can_begin(self) -> bool:
@@ -523,8 +545,11 @@ def _half_tangent(R: FloatArray) -> FloatArray:
     return out
 
 
-def _is_sane(window: Window, source: MotionSource | None) -> bool:
-    """Whether the state is made of numbers, and with an IMU of a possible speed."""
-    if not np.isfinite(window.prior.P).all() or not np.isfinite(window.nav.T_world_imu).all():
-        return False
-    return source != "imu" or length(window.nav.velocity) < _MAX_SPEED_MPS
+def _check_sane(window: Window, source: MotionSource | None, frame_index: int) -> None:
+    """Raise DivergedError where the state is not made of numbers, or with an IMU of an impossible
+    speed.
+    """
+    finite = np.isfinite(window.prior.P).all() and np.isfinite(window.nav.T_world_imu).all()
+    slow = source != "imu" or length(window.nav.velocity) < _MAX_SPEED_MPS
+    if not finite or not slow:
+        raise DivergedError(_lost(frame_index))

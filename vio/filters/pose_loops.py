@@ -198,6 +198,21 @@ def take_since_first(P: FloatArray, first: int, attitude: int, out: FloatArray) 
 
 
 @compiled
+def _place_after(i: int, at: int, k: int) -> int:
+    """Return the row that an error has once k others are inserted at a row."""
+    return i if i < at else i + k
+
+
+@compiled
+def _spread(P: FloatArray, at: int, k: int, out: FloatArray) -> None:
+    """Write a covariance (D, D) into a larger one, with room for k errors at a row."""
+    for i in range(len(P)):
+        row = _place_after(i, at, k)
+        for j in range(len(P)):
+            out[row, _place_after(j, at, k)] = P[i, j]
+
+
+@compiled
 def insert_rows(P: FloatArray, at: int, J: FloatArray, noise: FloatArray, out: FloatArray) -> None:
     """Write a covariance (D + k, D + k) with errors `J error + noise` at a row, from that of the
     others (D, D).
@@ -206,10 +221,7 @@ def insert_rows(P: FloatArray, at: int, J: FloatArray, noise: FloatArray, out: F
     """
     D = len(P)
     k = len(J)
-    for i in range(D):
-        row = i if i < at else i + k
-        for j in range(D):
-            out[row, j if j < at else j + k] = P[i, j]
+    _spread(P, at, k, out)
     for a in range(k):
         for j in range(D):
             beside = 0.0
@@ -218,7 +230,7 @@ def insert_rows(P: FloatArray, at: int, J: FloatArray, noise: FloatArray, out: F
                 if J[a, m] != 0.0:
                     beside += J[a, m] * P[m, j]
                     below += J[a, m] * P[j, m]
-            column = j if j < at else j + k
+            column = _place_after(j, at, k)
             out[at + a, column] = beside
             out[column, at + a] = below
     for a in range(k):
@@ -226,7 +238,7 @@ def insert_rows(P: FloatArray, at: int, J: FloatArray, noise: FloatArray, out: F
             total = 0.0
             for m in range(J.shape[1]):
                 if J[b, m] != 0.0:
-                    total += J[b, m] * out[at + a, m if m < at else m + k]
+                    total += J[b, m] * out[at + a, _place_after(m, at, k)]
             out[at + a, at + b] = total + noise[a, b]
 
 
@@ -340,10 +352,7 @@ def integrate(
     """Integrate readings (K, 6) `[gyro, accel]` at times (K,), equations (N1) to (N4)."""
     T = out.T
     v = out.v
-    Phi = out.Phi
-    Q = out.Q
     densities = noise.densities
-    walks = noise.walks
     R = T[:3, :3].copy()
     p = T[:3, 3].copy()
     new = np.empty((3, 3))
@@ -360,12 +369,7 @@ def integrate(
         a, b, _ = _sinc_terms(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
         for i in range(3):  # R exp(phi) is the transpose of exp(-phi) R'
             new[i, 0], new[i, 1], new[i, 2] = _turned(-phi[0], -phi[1], -phi[2], a, b, R[i])
-        for i in range(3):
-            force[i] = gravity[i]
-            for j in range(3):
-                before = readings[k, 3 + j] - bias[3 + j]
-                after = readings[k + 1, 3 + j] - bias[3 + j]
-                force[i] += 0.5 * (R[i, j] * before + new[i, j] * after)
+        _write_acceleration(R, new, readings[k : k + 2], bias, gravity, force)
         for i in range(3):
             pm[i] = p[i]
             vm[i] = v[i]
@@ -380,14 +384,42 @@ def integrate(
         for i in range(3):
             for j in range(3):
                 R[i, j] = new[i, j]
-    total = end * 1e-9
-    for i in range(15):
-        for j in range(15):
-            Q[i, j] = out.Q_parts[0, i, j] + out.Q_parts[1, i, j]
     for i in range(3):
         T[i, 3] = p[i]
         for j in range(3):
             T[i, j] = R[i, j]
+    _finish_growth(end * 1e-9, gravity, noise.walks, out)
+
+
+@compiled
+def _write_acceleration(
+    R: FloatArray,
+    new: FloatArray,
+    readings: FloatArray,
+    bias: FloatArray,
+    gravity: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the mean acceleration (3,) in the world between two readings (2, 6), at attitudes (3,
+    3) before and after.
+    """
+    for i in range(3):
+        out[i] = gravity[i]
+        for j in range(3):
+            before = readings[0, 3 + j] - bias[3 + j]
+            after = readings[1, 3 + j] - bias[3 + j]
+            out[i] += 0.5 * (R[i, j] * before + new[i, j] * after)
+
+
+@compiled
+def _finish_growth(total: float, gravity: FloatArray, walks: FloatArray, out: ImuStep) -> None:
+    """Write what depends on the whole time (s) alone into Phi, and add up Q."""
+    Phi = out.Phi
+    Q = out.Q
+    for i in range(15):
+        for j in range(15):
+            Q[i, j] = out.Q_parts[0, i, j] + out.Q_parts[1, i, j]
+    for i in range(3):
         j = (i + 1) % 3
         k = (i + 2) % 3
         Phi[i, 6 + i] = total  # (N2), the same for every state, which is the filter's point

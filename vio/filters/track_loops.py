@@ -55,6 +55,8 @@ def compare_views(cameras: Cameras, p: FloatArray, views: Views, at: Residuals) 
     J = at.z_D_p
     ahead = at.ahead
     fu, fv, cu, cv, baseline, _ = camera
+    centre = (cu, cv, cu, cv)
+    along = np.empty((2, 3))  # pixels by the camera's axes along them
     row1 = np.empty(3)
     row2 = np.empty(3)
     for f in range(len(p)):
@@ -65,29 +67,35 @@ def compare_views(cameras: Cameras, p: FloatArray, views: Views, at: Residuals) 
             depth = T[n, 2, 0] * p[f, 0] + T[n, 2, 1] * p[f, 1] + T[n, 2, 2] * p[f, 2] + T[n, 2, 3]
             azimuth, s, c, y, depth = turn_to(camera, y, depth)
             seen = weight[f, n, 0] > 0.0
-            usable = depth > least_depth
-            if seen and not usable:
-                ahead[f] = False
-            if not (seen and usable):
-                for a in range(4):
-                    r[f, n, a] = 0.0
-                    for j in range(3):
-                        J[f, n, a, j] = 0.0
+            if not (seen and depth > least_depth):
+                ahead[f] = ahead[f] and not seen
+                _clear_view(r[f, n], J[f, n])
                 continue
             _turned_rows(T[n], s, c, row1, row2)
             u = fu * x / depth
             v = fv * y / depth
-            d = fu * baseline / depth
-            row = fv * azimuth
+            right_u = u - fu * baseline / depth
+            seen_v = v + fv * azimuth
+            pixels = (u, v, right_u, v)
+            seen_at = (u, seen_v, right_u, seen_v)
+            for j in range(3):
+                along[0, j] = fu * T[n, 0, j]
+                along[1, j] = fv * row1[j]
             for a in range(4):
                 w = weight[f, n, a]
-                of_row = a == 1 or a == 3
-                pixel = v if of_row else u - d if a == 2 else u
-                seen_at = pixel + row if of_row else pixel
-                r[f, n, a] = (z[f, n, a] - seen_at - (cv if of_row else cu)) * w if w > 0.0 else 0.0
+                off = z[f, n, a] - seen_at[a] - centre[a]
+                r[f, n, a] = off * w if w > 0.0 else 0.0
                 for j in range(3):
-                    along = fv * row1[j] if of_row else fu * T[n, 0, j]
-                    J[f, n, a, j] = w * (along - pixel * row2[j]) / depth
+                    J[f, n, a, j] = w * (along[a % 2, j] - pixels[a] * row2[j]) / depth
+
+
+@compiled
+def _clear_view(r: FloatArray, J: FloatArray) -> None:
+    """Write zeros as residuals (4,) and Jacobians (4, 3) of a view that was not measured."""
+    for a in range(4):
+        r[a] = 0.0
+        for j in range(3):
+            J[a, j] = 0.0
 
 
 @compiled
@@ -300,9 +308,9 @@ def middle(values: FloatArray) -> float:
 
 
 @compiled
-def weigh_by_sigma(sigma: SigmaArray, least: float, most: float, weight: FloatArray) -> None:
-    """Multiply weights (N, 4), where above zero, by the median standard deviation over the
-    pixel's own (N, 3).
+def _median_sigma(sigma: SigmaArray, weight: FloatArray) -> float:
+    """Return the median of the standard deviations (N, 3) that are known of measured pixels; 0:
+    there is none.
     """
     values = np.empty(3 * len(sigma))
     count = 0
@@ -311,9 +319,17 @@ def weigh_by_sigma(sigma: SigmaArray, least: float, most: float, weight: FloatAr
             if weight[n, a] > 0.0 and sigma[n, a] > 0.0 and np.isfinite(sigma[n, a]):
                 values[count] = sigma[n, a]
                 count += 1
-    if count == 0:
+    return middle(values[:count]) if count > 0 else 0.0
+
+
+@compiled
+def weigh_by_sigma(sigma: SigmaArray, least: float, most: float, weight: FloatArray) -> None:
+    """Multiply weights (N, 4), where above zero, by the median standard deviation over the
+    pixel's own (N, 3).
+    """
+    centre = _median_sigma(sigma, weight)
+    if centre == 0.0:
         return
-    centre = middle(values[:count])
     for n in range(len(sigma)):
         for a in range(3):
             if weight[n, a] > 0.0 and sigma[n, a] > 0.0:
@@ -534,6 +550,15 @@ def put_ahead(cameras: Cameras, min_disparity: float, views: Views, p: FloatArra
 
 
 @compiled
+def _begin_information(tiny: float, prior: float, C: FloatArray) -> None:
+    """Write the information (3, 3) that there is of any point in the coordinates (M5)."""
+    _clear(C)
+    C[0, 0] = tiny
+    C[1, 1] = tiny
+    C[2, 2] = prior
+
+
+@compiled
 def step_points(at: Residuals, p_D_q: FloatArray, damping: Damping, dq: FloatArray) -> None:
     """Write a Gauss-Newton step (F, 3) of each point in the coordinates (M5), with Cauchy
     weights of a scale.
@@ -545,25 +570,16 @@ def step_points(at: Residuals, p_D_q: FloatArray, damping: Damping, dq: FloatArr
     for f in range(len(r)):
         for i in range(3):
             dq[f, i] = 0.0
-            for j in range(3):
-                C[i, j] = 0.0
-        C[0, 0] = damping.tiny
-        C[1, 1] = damping.tiny
-        C[2, 2] = damping.prior
+        _begin_information(damping.tiny, damping.prior, C)
         for n in range(r.shape[1]):
             if not _is_measured(J, f, n):
                 continue
             squares = r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
             w = 1.0 / (1.0 + squares / (4.0 * damping.scale2))
             for a in range(4):
-                if J[f, n, a, 0] == 0.0 and J[f, n, a, 1] == 0.0 and J[f, n, a, 2] == 0.0:
+                if _is_zero(J[f, n, a]):
                     continue
-                for i in range(3):
-                    row[i] = (
-                        J[f, n, a, 0] * p_D_q[f, 0, i]
-                        + J[f, n, a, 1] * p_D_q[f, 1, i]
-                        + J[f, n, a, 2] * p_D_q[f, 2, i]
-                    )
+                _by_point(J[f, n, a], p_D_q[f], row)
                 for i in range(3):
                     dq[f, i] += w * row[i] * r[f, n, a]
                     for j in range(i + 1):
@@ -671,6 +687,21 @@ def _mark_seen(weight: FloatArray, out: BoolArray) -> None:
 
 
 @compiled
+def _is_finite(p: FloatArray) -> bool:
+    """Whether a point (3,) is made of numbers."""
+    return np.isfinite(p[0]) and np.isfinite(p[1]) and np.isfinite(p[2])
+
+
+@compiled
+def _has_right_view(weight: FloatArray) -> bool:
+    """Whether some right camera saw a track, of weights (N, 4)."""
+    seen = False
+    for n in range(len(weight)):
+        seen = seen or weight[n, 2] > 0.0
+    return seen
+
+
+@compiled
 def mark_usable(
     cameras: Cameras,
     p: FloatArray,
@@ -692,22 +723,12 @@ def mark_usable(
     L = np.empty((3, 3))
     row = np.empty(3)
     for f in range(F):
-        keep[f] = (
-            at.ahead[f] and np.isfinite(p[f, 0]) and np.isfinite(p[f, 1]) and np.isfinite(p[f, 2])
-        )
-        by_right = False
-        for n in range(N):
-            by_right = by_right or weight[f, n, 2] > 0.0
-        if by_right or not keep[f]:
+        keep[f] = at.ahead[f] and _is_finite(p[f])
+        if not keep[f] or _has_right_view(weight[f]):
             continue
         _mark_seen(weight[f : f + 1], seen)
         anchor_points(cameras, p[f : f + 1], seen, q)
-        for i in range(3):
-            for j in range(3):
-                C[i, j] = 0.0
-        C[0, 0] = limits.tiny
-        C[1, 1] = limits.tiny
-        C[2, 2] = limits.prior
+        _begin_information(limits.tiny, limits.prior, C)
         for n in range(N):
             for a in range(4):
                 _by_point(J[f, n, a], q.p_D_q[0], row)
@@ -805,7 +826,7 @@ def add_landmarks(
         own = rows.landmarks + 3 * k
         for a in range(4):
             row = J[k, a]
-            if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
+            if _is_zero(row):
                 continue
             for s in range(terms):
                 h[s] = seen.precision[k, a] * H[k, a, s]
@@ -828,13 +849,26 @@ def add_landmarks(
                 for s in range(estimated, terms):
                     considered[own + i, s - estimated] += wJ * h[s]
                     considered[exposure + i, s - estimated] -= wJ * h[s]
-            for s in range(estimated):
-                wh = weight[k] * h[s]
-                b[stereo + s] += wh * r[k, a]
-                for t in range(estimated):
-                    A[stereo + s, stereo + t] += wh * h[t]
-                for t in range(estimated, terms):
-                    considered[stereo + s, t - estimated] += wh * h[t]
+            _add_coefficients(weight[k], r[k, a], h, stereo, out)
+
+
+@compiled
+def _add_coefficients(
+    weight: float, r: float, h: FloatArray, stereo: int, out: Information
+) -> None:
+    """Add what a pixel says of the coefficients alone, by its Jacobian (S,)."""
+    A = out.A
+    b = out.b
+    considered = out.considered
+    terms = len(h)
+    estimated = terms - considered.shape[1]
+    for s in range(estimated):
+        wh = weight * h[s]
+        b[stereo + s] += wh * r
+        for t in range(estimated):
+            A[stereo + s, stereo + t] += wh * h[t]
+        for t in range(estimated, terms):
+            considered[stereo + s, t - estimated] += wh * h[t]
 
 
 @compiled
@@ -937,27 +971,13 @@ def collect_tracks(
     anchor_points(cameras, p, seen, out.q)
     for f in range(len(r)):
         _point_D_pose(out.q.q_D_p[f], p[f], B[f])
-        for i in range(3):
-            point_gradient[f, i] = 0.0
-            for j in range(3):
-                C[f, i, j] = 0.0
+        _clear_point(point_gradient[f], C[f])
         for n in range(r.shape[1]):
             if weight[f, n] == 0.0 and n != out.q.anchor[f]:
-                for k in range(6 * n, 6 * n + 6):
-                    gradient[f, k] = G[f, k, 0] = G[f, k, 1] = G[f, k, 2] = 0.0
+                _clear_clone(n, gradient[f], G[f])
                 continue
-            for i in range(3):
-                g_i[i] = 0.0
-                for j in range(3):
-                    C_i[i, j] = 0.0
-            for a in range(4):
-                if _is_zero(J[f, n, a]):
-                    continue
-                _by_point(J[f, n, a], p_D_q[f], row)
-                for i in range(3):
-                    g_i[i] += weight[f, n] * row[i] * r[f, n, a]
-                    for j in range(3):
-                        C_i[i, j] += weight[f, n] * row[i] * row[j]
+            _clear_point(g_i, C_i)
+            _add_view(J[f, n], r[f, n], weight[f, n], p_D_q[f], row, g_i, C_i)
             if n == out.q.anchor[f]:
                 C_i[2, 2] += prior
             for i in range(3):
@@ -971,6 +991,45 @@ def collect_tracks(
                 gradient[f, 6 * n + k] = b0 * g_i[0] + b1 * g_i[1] + b2 * g_i[2]
                 for j in range(3):
                     G[f, 6 * n + k, j] = b0 * C_i[0, j] + b1 * C_i[1, j] + b2 * C_i[2, j]
+
+
+@compiled
+def _clear_point(g: FloatArray, C: FloatArray) -> None:
+    """Write zeros as gradient (3,) and information (3, 3) of a point."""
+    for i in range(3):
+        g[i] = 0.0
+        for j in range(3):
+            C[i, j] = 0.0
+
+
+@compiled
+def _clear_clone(n: int, gradient: FloatArray, G: FloatArray) -> None:
+    """Write zeros as a clone's part in gradient (6N,) and information (6N, 3) of a track."""
+    for k in range(6 * n, 6 * n + 6):
+        gradient[k] = G[k, 0] = G[k, 1] = G[k, 2] = 0.0
+
+
+@compiled
+def _add_view(
+    J: FloatArray,
+    r: FloatArray,
+    weight: float,
+    p_D_q: FloatArray,
+    row: FloatArray,
+    g: FloatArray,
+    C: FloatArray,
+) -> None:
+    """Add what a view's Jacobians (4, 3) and residuals (4,) say of a point to gradient (3,) and
+    information (3, 3); `row` (3,) is room.
+    """
+    for a in range(4):
+        if _is_zero(J[a]):
+            continue
+        _by_point(J[a], p_D_q, row)
+        for i in range(3):
+            g[i] += weight * row[i] * r[a]
+            for j in range(3):
+                C[i, j] += weight * row[i] * row[j]
 
 
 @compiled
@@ -1131,6 +1190,22 @@ def stereo_sigmas(
 
 
 @compiled
+def _innovation_covariance(
+    B: FloatArray, moved: FloatArray, variance: float, BM: FloatArray, S: FloatArray
+) -> None:
+    """Write the lower triangle of `B moved B' + variance` (4, 4), with room (4, 6) for `B moved`."""
+    for a in range(4):
+        for j in range(6):
+            BM[a, j] = 0.0
+            for i in range(6):
+                BM[a, j] += B[a, i] * moved[i, j]
+        for b in range(a + 1):
+            S[a, b] = variance if a == b else 0.0
+            for j in range(6):
+                S[a, b] += BM[a, j] * B[b, j]
+
+
+@compiled
 def innovations(
     r: FloatArray,
     J: FloatArray,
@@ -1155,7 +1230,7 @@ def innovations(
         count[f] = 0
         for a in range(4):
             x = J[f, last, a]
-            count[f] += x[0] != 0.0 or x[1] != 0.0 or x[2] != 0.0
+            count[f] += not _is_zero(x)
             B[a, 0] = x[0]
             B[a, 1] = x[1]
             B[a, 2] = x[2]
@@ -1163,15 +1238,7 @@ def innovations(
             B[a, 4] = p[f, 2] * x[0] - p[f, 0] * x[2]
             B[a, 5] = p[f, 0] * x[1] - p[f, 1] * x[0]
             y[a] = r[f, last, a]
-        for a in range(4):
-            for j in range(6):
-                BM[a, j] = 0.0
-                for i in range(6):
-                    BM[a, j] += B[a, i] * moved[i, j]
-            for b in range(a + 1):
-                S[a, b] = variance if a == b else 0.0
-                for j in range(6):
-                    S[a, b] += BM[a, j] * B[b, j]
+        _innovation_covariance(B, moved, variance, BM, S)
         solve_positive(S, y)
         total = 0.0
         for a in range(4):
@@ -1229,22 +1296,10 @@ def eliminate_columns(
                     h[s] = at.weight[f, n, a] * H[a, chosen[s]]
                     wh[s] = weight[f, n] * h[s]
                     own_b[s] += wh[s] * at.r[f, n, a]
-                for s in range(terms):
-                    if h[s] != 0.0:  # left pixels do not depend on the right camera
-                        for t in range(terms):
-                            own[s, t] += wh[s] * h[t]
-                for i in range(3):
-                    for s in range(terms):
-                        of_view[i, s] += by_q[i] * wh[s]
-                        sums[i, s] += by_q[i] * wh[s]
-            for k in range(6):
-                b0 = B[f, 0, k]
-                b1 = B[f, 1, k]
-                b2 = B[f, 2, k]
-                for s in range(terms):
-                    A[6 * n + k, size + s] += (
-                        b0 * of_view[0, s] + b1 * of_view[1, s] + b2 * of_view[2, s]
-                    )
+                _add_products(h, wh, own)
+                _add_outer(by_q, wh, of_view)
+                _add_outer(by_q, wh, sums)
+            _add_clone_terms(n, B[f], of_view, size, A)
         _factor(info.C[f], L)
         _solve_lower(L, info.point_gradient[f], y)
         for s in range(terms):
@@ -1252,8 +1307,48 @@ def eliminate_columns(
             G[f, s, 1] = sums[1, s]
             G[f, s, 2] = sums[2, s]
             b[size + s] += own_b[s] - _whiten(L, G[f, s], y, out.V, c, size + s)
-            for t in range(terms):
-                A[size + s, size + t] += own[s, t] if t <= s else own[t, s]
+        _add_own(own, size, A)
+
+
+@compiled
+def _add_products(h: FloatArray, wh: FloatArray, own: FloatArray) -> None:
+    """Add what a pixel says of coefficients, by its Jacobian (S,), also times its weight, to (S,
+    S).
+    """
+    for s in range(len(h)):
+        if h[s] != 0.0:  # left pixels do not depend on the right camera
+            for t in range(len(h)):
+                own[s, t] += wh[s] * h[t]
+
+
+@compiled
+def _add_outer(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Add the products (3, S) of numbers (3,) and (S,)."""
+    for i in range(3):
+        for s in range(len(b)):
+            out[i, s] += a[i] * b[s]
+
+
+@compiled
+def _add_clone_terms(n: int, B: FloatArray, of_view: FloatArray, size: int, A: FloatArray) -> None:
+    """Add the part (3, S) of a view to the rows of its clone, behind the columns of all clones, by
+    the Jacobian (3, 6) of the point by the clone's pose.
+    """
+    terms = of_view.shape[1]
+    for k in range(6):
+        b0 = B[0, k]
+        b1 = B[1, k]
+        b2 = B[2, k]
+        for s in range(terms):
+            A[6 * n + k, size + s] += b0 * of_view[0, s] + b1 * of_view[1, s] + b2 * of_view[2, s]
+
+
+@compiled
+def _add_own(own: FloatArray, size: int, A: FloatArray) -> None:
+    """Add the lower triangle of a symmetric (S, S) to the rows and columns of the coefficients."""
+    for s in range(len(own)):
+        for t in range(len(own)):
+            A[size + s, size + t] += own[s, t] if t <= s else own[t, s]
 
 
 @compiled
@@ -1284,6 +1379,32 @@ def write_directions(rows: IntArray, T: FloatArray, p: FloatArray, out: FloatArr
 
 
 @compiled
+def _ends(G: FloatArray) -> tuple[int, int]:
+    """Return the first and the last clone with a part in the normal equations (6N, 3) of a track."""
+    first = -1
+    last = -1
+    for n in range(len(G) // 6):
+        if G[6 * n, 0] != 0.0 or G[6 * n + 1, 1] != 0.0:
+            last = n
+            if first < 0:
+                first = n
+    return first, last
+
+
+@compiled
+def _write_moves_about(centre: FloatArray, B: FloatArray) -> None:
+    """Write how motions (6,) about a centre (3,) move a pose at the origin, into zeros (6, 6)."""
+    for i in range(6):
+        B[i, i] = 1.0
+    B[0, 4] = -centre[2]
+    B[0, 5] = centre[1]
+    B[1, 3] = centre[2]
+    B[1, 5] = -centre[0]
+    B[2, 3] = -centre[1]
+    B[2, 4] = centre[0]
+
+
+@compiled
 def score_drifts(
     rows: IntArray,
     info: TrackColumns,
@@ -1304,23 +1425,9 @@ def score_drifts(
     own = np.empty((6, 6))
     g = np.empty(6)
     B = np.zeros((6, 6))
-    for i in range(6):
-        B[i, i] = 1.0
-    B[0, 4] = -centre[2]
-    B[0, 5] = centre[1]
-    B[1, 3] = centre[2]
-    B[1, 5] = -centre[0]
-    B[2, 3] = -centre[1]
-    B[2, 4] = centre[0]
+    _write_moves_about(centre, B)
     for k, f in enumerate(rows):
-        first = -1
-        last = -1
-        N = G.shape[1] // 6
-        for n in range(N):
-            if G[f, 6 * n, 0] != 0.0 or G[f, 6 * n + 1, 1] != 0.0:
-                last = n
-                if first < 0:
-                    first = n
+        first, last = _ends(G[f])
         sums[:] = 0.0
         own[:] = 0.0
         g[:] = 0.0

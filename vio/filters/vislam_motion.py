@@ -119,8 +119,8 @@ class HeldInput:
         cuts = [start_ns, *(t for t in times if start_ns < t < end_ns), end_ns]
         # Linear interpolation at the cuts, held constant outside the samples.
         at_cuts = np.stack([np.interp(cuts, times, column) for column in inputs.T], axis=1)
-        kept = [i for i, t in enumerate(times) if t <= end_ns][-1:]
-        self._samples = samples[kept[0] if kept else 0 :]
+        past = int(np.searchsorted(times, end_ns, side="right"))
+        self._samples = samples[max(past - 1, 0) :]
         first, second = {"midpoint": (0.5, 0.5), "start": (1.0, 0.0), "end": (0.0, 1.0)}[
             self._settings.input_at
         ]

@@ -99,6 +99,13 @@ PROJECTIONS: Mapping[Projection, PinholeRows] = {
 }
 
 
+def _check_size(name: str, size: int | None) -> None:
+    if size is not None and not (isinstance(size, Integral) and size > 0):
+        raise CalibrationError(
+            f"the image {name} is a positive whole number of pixels, got {size!r}"
+        )
+
+
 @dataclass(frozen=True, slots=True)
 class StereoCamera:
     """A rectified stereo pair: one intrinsic matrix, image rows aligned, cam1 at +baseline on
@@ -126,11 +133,8 @@ class StereoCamera:
         values = (self.fu, self.fv, self.cu, self.cv, self.baseline_m)
         if not all(isinstance(value, Real) for value in values):
             raise CalibrationError(f"camera intrinsics are single numbers, got {values!r}"[:300])
-        for name, size in (("width", self.width), ("height", self.height)):
-            if size is not None and not (isinstance(size, Integral) and size > 0):
-                raise CalibrationError(
-                    f"the image {name} is a positive whole number of pixels, got {size!r}"
-                )
+        _check_size("width", self.width)
+        _check_size("height", self.height)
         if not np.all(np.isfinite(values)):
             raise CalibrationError(
                 f"camera intrinsics are not finite: {values}; check the calibration file"

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -157,9 +157,7 @@ class ImuSampleCheck:
 
     def _take_unusual(self, sample: ImuSample, reading: _Reading) -> list[ImuSample]:
         if self._previous is not None:
-            equal = [a == b for a, b in zip(self._last_reading, reading, strict=True)]
-            ended = [f for r in self._repeats for f in r.take(self._previous, sample, equal)]
-            self._faults += ended[:1]  # that of the whole IMU is that of both sensors
+            self._count_repeated(self._previous, sample, reading)
         # gravity is never zero in all axes
         if any(r.stuck for r in self._repeats) or not any(reading[3:]):
             self._held = []
@@ -175,6 +173,11 @@ class ImuSampleCheck:
         usable += self._spikes.take(sample, reading)
         self._faults += self._spikes.new_faults()
         return usable
+
+    def _count_repeated(self, previous: ImuSample, sample: ImuSample, reading: _Reading) -> None:
+        equal = [a == b for a, b in zip(self._last_reading, reading, strict=True)]
+        ended = [f for r in self._repeats for f in r.take(previous, sample, equal)]
+        self._faults += ended[:1]  # that of the whole IMU is that of both sensors
 
     def new_faults(self) -> tuple[ImuFault, ...]:
         """Return the faults that ended since the last call."""
@@ -263,36 +266,47 @@ class _Repetition:
         self._equal += equal
 
 
+class _KnownRanges(NamedTuple):
+    """What the readings so far say of where both sensors' ranges end."""
+
+    last: FloatArray  # (6,) the reading before
+    extreme: FloatArray  # (6,) largest magnitude so far
+    repeats: IntArray  # (6,) of it, in a row
+    unchanged: IntArray  # (6,) readings so far that repeat the one before, but for those
+    changed: IntArray  # (6,) readings so far that do not
+    recent: FloatArray  # (S, 6) the last readings, as many as there are
+    counts: IntArray  # (2,) readings so far, and recent ones
+    ends: FloatArray  # (2,) of the ranges; infinite: unknown
+
+
 class _Ranges:
     """Learns where the ranges of both sensors end, and tells the readings there."""
 
     def __init__(self) -> None:
-        self._last = np.zeros(6)  # the reading before
-        self._extreme = np.zeros(6)  # largest magnitude so far
-        self._repeats = np.zeros(6, dtype=np.int64)  # of it, in a row
-        self._equal = np.zeros(6, dtype=np.int64)  # readings so far that repeat another one
-        self._changed = np.zeros(6, dtype=np.int64)  # readings so far that repeat none
-        self._recent = np.zeros((_NOISY, 6))  # the last readings, as many as there are
-        self._counts = np.zeros(2, dtype=np.int64)  # readings so far, and recent ones
-        self._ends = np.full(2, np.inf)  # of the ranges; infinite: unknown
+        self._last = np.zeros(6)
+        self._extreme = np.zeros(6)
+        self._repeats = np.zeros(6, dtype=np.int64)
+        self._unchanged = np.zeros(6, dtype=np.int64)
+        self._changed = np.zeros(6, dtype=np.int64)
+        self._recent = np.zeros((_NOISY, 6))
+        self._counts = np.zeros(2, dtype=np.int64)
+        self._ends = np.full(2, np.inf)
         self._are_clipped = [False, False]  # the last sample's
 
     def take(self, readings: FloatArray) -> BoolArray:
         """Return which (K, 2) of the next readings (K, 6) are at the end of each sensor's range."""
         clipped = np.empty((len(readings), 2), dtype=np.bool_)
-        _mark_clipped(
-            readings,
+        known = _KnownRanges(
             self._last,
             self._extreme,
             self._repeats,
-            self._equal,
+            self._unchanged,
             self._changed,
             self._recent,
             self._counts,
             self._ends,
-            _FAULTS.min_history,
-            clipped,
         )
+        _mark_clipped(readings, known, _FAULTS.min_history, clipped)
         return clipped
 
     def faults(self, samples: Sequence[ImuSample], clipped: BoolArray) -> list[ImuFault]:
@@ -314,99 +328,160 @@ class _Ranges:
 
 @compiled
 def _mark_clipped(
-    readings: FloatArray,
-    last: FloatArray,
-    extreme: FloatArray,
-    repeats: IntArray,
-    unchanged: IntArray,
-    changed: IntArray,
-    recent: FloatArray,
-    counts: IntArray,
-    ends: FloatArray,
-    min_history: int,
-    clipped: BoolArray,
+    readings: FloatArray, known: _KnownRanges, min_history: int, clipped: BoolArray
 ) -> None:
     """Mark which of the next readings (K, 6) are at the end of a sensor's range, (K, 2), and learn
-    from them where it is.
-
-    An axis that repeats its largest reading (`at_end`) more often than its repetitions so far make
-    probable, while another axis of the sensor goes to and fro, is at the end of the range.
-
-    Args:
-        readings: gyro and accelerometer.
-        last: (6,) the reading before, and all that follows; they are brought up to date.
-        extreme: (6,) largest magnitude so far.
-        repeats: (6,) of it, in a row.
-        unchanged: (6,) readings that repeat the one before, but for those.
-        changed: (6,) readings that do not.
-        recent: (S, 6) the last readings.
-        counts: readings so far, and how many of `recent` there are.
-        ends: (2,) of the ranges; infinite: unknown.
-        min_history: readings before an end is learned.
-        clipped: what is marked.
+    from them where it is, from `min_history` readings on.
     """
     n = len(readings)
     equal = np.empty((n, 6), dtype=np.bool_)
     at_end = np.empty((n, 6), dtype=np.bool_)
+    _mark_repeated(readings, known, equal)
     for sensor in range(2):
-        first = 3 * sensor
-        end = ends[sensor]
-        beyond = False
-        some_at_end = False
+        known_from = _learn_end(readings, equal, at_end, known, sensor, min_history)
         for k in range(n):
-            all_equal = True
-            for i in range(first, first + 3):
-                before = last[i] if k == 0 else readings[k - 1, i]
-                equal[k, i] = (k > 0 or counts[0] > 0) and readings[k, i] == before
-                all_equal = all_equal and equal[k, i]
-                beyond = beyond or abs(readings[k, i]) > (1 + _RANGE_SLACK) * end
-            for i in range(first, first + 3):
-                size = abs(readings[k, i])
-                if size > extreme[i]:
-                    extreme[i] = size
-                at_end[k, i] = equal[k, i] and size >= extreme[i] and size > 0 and not all_equal
-                some_at_end = some_at_end or at_end[k, i]
-        if beyond:
-            end = np.inf
-        known_from = 0  # the first from which on the end is known
-        if end == np.inf and not some_at_end:
-            for i in range(first, first + 3):
-                repeats[i] = 0
-        counted = end < np.inf or not some_at_end  # whether there is nothing to learn
-        for k in range(n):
-            seen = counts[0] + k
-            largest = 0.0
-            if not counted:
-                for i in range(first, first + 3):
-                    repeats[i] = repeats[i] + 1 if at_end[k, i] else 0
-                    if at_end[k, i] and seen >= min_history and changed[i] >= min_history:
-                        share = (unchanged[i] + 1) / (seen + 2)
-                        if repeats[i] * np.log(share) < _LOG_MIN_CHANCE:
-                            largest = max(largest, abs(readings[k, i]))
-            if largest > 0 and _has_noise(recent, counts[1], readings, k, at_end, first):
-                end = largest
-                known_from = k
-                counted = True
-                for i in range(first, first + 3):
-                    repeats[i] = 0
-            for i in range(first, first + 3):
-                unchanged[i] += equal[k, i] and not at_end[k, i]
-                changed[i] += not equal[k, i]
-        ends[sensor] = end
-        for k in range(n):
-            clipped[k, sensor] = False
-            for i in range(first, first + 3):
-                at = k >= known_from and end < np.inf and abs(readings[k, i]) >= end
-                clipped[k, sensor] = clipped[k, sensor] or at
-    kept = min(len(recent), counts[1] + n)
-    for m in range(kept):  # in order: what is read lies at or behind what is written
-        place = counts[1] + n - kept + m
+            reaches = _reaches(readings[k], 3 * sensor, known.ends[sensor])
+            clipped[k, sensor] = k >= known_from and reaches
+    _remember(readings, known)
+
+
+@compiled
+def _learn_end(
+    readings: FloatArray,
+    equal: BoolArray,
+    at_end: BoolArray,
+    known: _KnownRanges,
+    sensor: int,
+    min_history: int,
+) -> int:
+    """Learn from readings where a sensor's range ends, and write which of its numbers repeat the
+    largest one so far; return the first reading from which on the end is known.
+    """
+    first = 3 * sensor
+    if _is_beyond(readings, first, known.ends[sensor]):
+        known.ends[sensor] = np.inf
+    is_unknown = known.ends[sensor] == np.inf
+    learns = _mark_at_end(readings, equal, first, known.extreme, at_end) and is_unknown
+    if is_unknown and not learns:
+        _clear(first, known.repeats)
+    known_from = 0
+    for k in range(len(readings)):
+        if learns and _finds_end(readings, k, at_end, known, sensor, min_history):
+            known_from = k
+            learns = False
+        _count_changes(equal[k], at_end[k], first, known)
+    return known_from
+
+
+@compiled
+def _mark_repeated(readings: FloatArray, known: _KnownRanges, equal: BoolArray) -> None:
+    """Write which numbers of the readings (K, 6) are those of the reading before."""
+    for k in range(len(readings)):
         for i in range(6):
-            recent[m, i] = recent[place, i] if place < counts[1] else readings[place - counts[1], i]
+            before = known.last[i] if k == 0 else readings[k - 1, i]
+            equal[k, i] = (k > 0 or known.counts[0] > 0) and readings[k, i] == before
+
+
+@compiled
+def _is_beyond(readings: FloatArray, first: int, end: float) -> bool:
+    """Whether some reading of a sensor, whose axes begin at `first`, shows that its range does not
+    end there.
+    """
+    for k in range(len(readings)):
+        for i in range(first, first + 3):
+            if abs(readings[k, i]) > (1 + _RANGE_SLACK) * end:
+                return True
+    return False
+
+
+@compiled
+def _mark_at_end(
+    readings: FloatArray, equal: BoolArray, first: int, extreme: FloatArray, at_end: BoolArray
+) -> bool:
+    """Write which numbers of a sensor repeat the largest one so far while another axis changes;
+    return whether any does.
+    """
+    any_at_end = False
+    for k in range(len(readings)):
+        all_equal = equal[k, first] and equal[k, first + 1] and equal[k, first + 2]
+        for i in range(first, first + 3):
+            size = abs(readings[k, i])
+            if size > extreme[i]:
+                extreme[i] = size
+            at_end[k, i] = equal[k, i] and size >= extreme[i] and size > 0 and not all_equal
+            any_at_end = any_at_end or at_end[k, i]
+    return any_at_end
+
+
+@compiled
+def _finds_end(
+    readings: FloatArray,
+    k: int,
+    at_end: BoolArray,
+    known: _KnownRanges,
+    sensor: int,
+    min_history: int,
+) -> bool:
+    """Whether reading k shows the end of a sensor's range, which is then noted.
+
+    An axis that repeats its largest reading more often than its repetitions so far make probable,
+    while another axis of the sensor goes to and fro, is at the end of the range.
+    """
+    first = 3 * sensor
+    seen = known.counts[0] + k
+    largest = 0.0
+    for i in range(first, first + 3):
+        known.repeats[i] = known.repeats[i] + 1 if at_end[k, i] else 0
+        if at_end[k, i] and seen >= min_history and known.changed[i] >= min_history:
+            share = (known.unchanged[i] + 1) / (seen + 2)
+            if known.repeats[i] * np.log(share) < _LOG_MIN_CHANCE:
+                largest = max(largest, abs(readings[k, i]))
+    if largest == 0 or not _has_noise(known.recent, known.counts[1], readings, k, at_end, first):
+        return False
+    known.ends[sensor] = largest
+    _clear(first, known.repeats)
+    return True
+
+
+@compiled
+def _clear(first: int, repeats: IntArray) -> None:
+    """Forget how often the axes of a sensor repeated their largest reading."""
+    for i in range(first, first + 3):
+        repeats[i] = 0
+
+
+@compiled
+def _count_changes(equal: BoolArray, at_end: BoolArray, first: int, known: _KnownRanges) -> None:
+    """Count which numbers of a sensor's reading (6,) repeat the one before, and which do not."""
+    for i in range(first, first + 3):
+        known.unchanged[i] += equal[i] and not at_end[i]
+        known.changed[i] += not equal[i]
+
+
+@compiled
+def _reaches(reading: FloatArray, first: int, end: float) -> bool:
+    """Whether some axis of a sensor reads the known end of its range, or more."""
+    reaches = False
+    for i in range(first, first + 3):
+        reaches = reaches or abs(reading[i]) >= end
+    return reaches and end < np.inf
+
+
+@compiled
+def _remember(readings: FloatArray, known: _KnownRanges) -> None:
+    """Note that these readings were the last ones."""
+    n = len(readings)
+    recent = known.recent
+    before = known.counts[1]
+    kept = min(len(recent), before + n)
+    for m in range(kept):  # in order: what is read lies at or behind what is written
+        place = before + n - kept + m
+        for i in range(6):
+            recent[m, i] = recent[place, i] if place < before else readings[place - before, i]
     for i in range(6):
-        last[i] = readings[n - 1, i]
-    counts[0] += n
-    counts[1] = kept
+        known.last[i] = readings[n - 1, i]
+    known.counts[0] += n
+    known.counts[1] = kept
 
 
 @compiled
@@ -567,17 +642,33 @@ def _count_plain(
     """
     for k in range(len(times)):
         before = last if k == 0 else readings[k - 1]
-        near = times[k] - (last_ns if k == 0 else times[k - 1]) <= longest_ns
-        gyro_changed = False
-        accel_changed = False
-        accel_reads = False
+        since_ns = times[k] - (last_ns if k == 0 else times[k - 1])
         for i in range(6):
             changes[k, i] = readings[k, i] - before[i]
-            if near and abs(changes[k, i]) > limit[i]:
-                return k
-            gyro_changed = gyro_changed or (i < 3 and readings[k, i] != before[i])
-            accel_changed = accel_changed or (i >= 3 and readings[k, i] != before[i])
-            accel_reads = accel_reads or (i >= 3 and readings[k, i] != 0.0)
-        if not (gyro_changed and accel_changed and accel_reads):
+        if since_ns <= longest_ns and _exceeds(changes[k], limit):
+            return k
+        if not _is_new(readings[k], before):
             return k
     return len(times)
+
+
+@compiled
+def _exceeds(change: FloatArray, limit: FloatArray) -> bool:
+    """Whether some of the changes (6,) is larger than its limit (6,)."""
+    exceeds = False
+    for i in range(6):
+        exceeds = exceeds or abs(change[i]) > limit[i]
+    return exceeds
+
+
+@compiled
+def _is_new(reading: FloatArray, before: FloatArray) -> bool:
+    """Whether gyro and accelerometer both read something else than before, the latter not zero."""
+    gyro_changed = False
+    accel_changed = False
+    accel_reads = False
+    for i in range(3):
+        gyro_changed = gyro_changed or reading[i] != before[i]
+        accel_changed = accel_changed or reading[3 + i] != before[3 + i]
+        accel_reads = accel_reads or reading[3 + i] != 0.0
+    return gyro_changed and accel_changed and accel_reads

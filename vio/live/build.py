@@ -175,6 +175,32 @@ def _features(dataset: Dataset, config: Config) -> Dataset:
     return features
 
 
+def _frontend(source: Source, config: Config, parts: Parts, seen: StereoCamera) -> Frontend:
+    """Return the caller's own front end, or the configured one, for a camera."""
+    from vio.frontend.given import as_frontend  # they load OpenCV
+    from vio.frontend.precomputed import PrecomputedFrontend
+
+    name = config.frontend.name if config.frontend.features is None else "precomputed"
+    if parts.frontend is None:
+        frontend = build_frontend(name, seen, config.frontend, source.features)
+    else:
+        frontend = as_frontend(parts.frontend, seen, config.frontend)
+    if isinstance(frontend, PrecomputedFrontend):
+        frontend.right_delay = source.right_delay
+    return frontend
+
+
+def _trial(source: Source, parts: Parts, backend: Backend, map: MapUse | None) -> ImuTrial | None:
+    """Return what tries other readings of an IMU beside the run; None: it is used as given.
+
+    One camera has no scale without its IMU; a map holds keyframes of the poses that were replaced.
+    """
+    has_scale_alone = source.motion == "imu" and source.camera.kind != "mono"
+    if not has_scale_alone or parts.backend is not None or map is not None:
+        return None
+    return ImuTrial(backend)
+
+
 def build_processor(
     source: Source, config: Config, parts: Parts, map: MapUse | None = None
 ) -> EventProcessor:
@@ -184,9 +210,7 @@ def build_processor(
         ConfigError: the settings contradict one another, the camera or the back end.
         DataError: the map cannot be used.
     """
-    from vio.frontend.given import as_frontend  # they load OpenCV
-    from vio.frontend.precomputed import PrecomputedFrontend
-    from vio.guard.guarded import guarded
+    from vio.guard.guarded import guarded  # loads OpenCV
 
     camera = source.camera
     features = source.features
@@ -196,14 +220,7 @@ def build_processor(
             f"lag_frames={config.lag_frames}: needs backend msckf, and must be below msckf.clones"
         )
     seen = camera if features is None else features.recording.camera
-    name = config.frontend.name if config.frontend.features is None else "precomputed"
-    frontend = (
-        build_frontend(name, seen, config.frontend, features)
-        if parts.frontend is None
-        else as_frontend(parts.frontend, seen, config.frontend)
-    )
-    if isinstance(frontend, PrecomputedFrontend):
-        frontend.right_delay = source.right_delay
+    frontend = _frontend(source, config, parts, seen)
     pipeline = FramePipeline(
         camera,
         source.T_cam0_body,
@@ -215,14 +232,7 @@ def build_processor(
             backend=backend,
         ),
         use_prior=config.frontend.prior,
-        # One camera has no scale without its IMU; a map holds keyframes of the poses that were
-        # replaced.
-        trial=ImuTrial(backend)
-        if source.motion == "imu"
-        and camera.kind != "mono"
-        and parts.backend is None
-        and map is None
-        else None,
+        trial=_trial(source, parts, backend, map),
     )
     session = None if map is None else _open_map(map, source, config, backend)
     return EventProcessor(pipeline, wait_for_imu=source.motion == "imu", map=session)

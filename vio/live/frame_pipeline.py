@@ -25,6 +25,7 @@ from vio.records import (
     MotionSample,
     MotionSource,
     Observations,
+    Prediction,
     Selection,
     StereoFrame,
     UpdateReport,
@@ -86,13 +87,7 @@ class FramePipeline:
         expected = self.backend.predict(frame.time_ns)
         timer.end("predict")
         try:
-            if self.monitor.repeats(frame, expected):
-                output = no_features(frame)
-            else:
-                checked = self.monitor.without_repeated_depth(frame)
-                output = self.frontend.process(
-                    checked, expected.tracks if expected and self._use_prior else None
-                )
+            output = self._track(frame, expected)
         except DataError as error:
             self.monitor.refused(frame.index, str(error))
             return None
@@ -132,6 +127,14 @@ class FramePipeline:
             estimate,
             _frame_log(frame, timer.ms, output, selection, report, estimate),
         )
+
+    def _track(self, frame: StereoFrame, expected: Prediction | None) -> FrontendOutput:
+        """Return what the front end makes of a frame, nothing of one that was given before."""
+        if self.monitor.repeats(frame, expected):
+            return no_features(frame)
+        checked = self.monitor.without_repeated_depth(frame)
+        prior = expected.tracks if expected and self._use_prior else None
+        return self.frontend.process(checked, prior)
 
     def usable(self, sample: MotionSample) -> MotionSample | None:
         """Return a sample as the back end takes it.

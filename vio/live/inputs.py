@@ -118,23 +118,24 @@ class Inputs:
         given = "stereo" if right is not None else "mono" if depth_m is None else "rgbd"
         if given != self._camera:
             raise DataError(f"{_CAME[given]} came, but this rig takes {_TAKES[self._camera]}")
-        images = [_checked_image(left, "left", self._shapes[0])]
-        if right is not None:
-            images.append(_checked_image(right, "right", self._shapes[1]))
-            if self._shapes[0] is None and images[0].shape[:2] != images[1].shape[:2]:
-                sizes = [image.shape[:2] for image in images]
-                raise DataError(f"the images differ in size: {sizes[0]} left, {sizes[1]} right")
+        images = self._checked_images(left, right)
         depth = None if depth_m is None else checked_depths(depth_m, images[0].shape[:2])
         numbered = self._numbered(t_ns, "images")
         if numbered is None:
             return None
         for k, image in enumerate(images):
             if copy or not (image.flags.carray and image.flags.owndata):
-                # Without letting another thread run, which would give way after 5 ms only.
-                images[k] = np.frombuffer(bytearray(image.data), dtype=np.uint8).reshape(
-                    image.shape
-                )
+                images[k] = _copied(image)
         return GivenFrame(*numbered, tuple(images), depth)
+
+    def _checked_images(self, left: npt.ArrayLike, right: npt.ArrayLike | None) -> list[Image]:
+        images = [_checked_image(left, "left", self._shapes[0])]
+        if right is not None:
+            images.append(_checked_image(right, "right", self._shapes[1]))
+            if self._shapes[0] is None and images[0].shape[:2] != images[1].shape[:2]:
+                sizes = [image.shape[:2] for image in images]
+                raise DataError(f"the images differ in size: {sizes[0]} left, {sizes[1]} right")
+        return images
 
     def observations(
         self, t_ns: Any, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None
@@ -365,6 +366,11 @@ def checked_observations(
             f"observations at {time_ns} ns: {wrong} pixels are not finite, or in no image"
         )
     return seen
+
+
+def _copied(image: Image) -> Image:
+    # Without letting another thread run, which would give way after 5 ms only.
+    return np.frombuffer(bytearray(image.data), dtype=np.uint8).reshape(image.shape)
 
 
 def _checked_image(

@@ -17,6 +17,7 @@ import sys
 import threading
 import urllib.error
 import urllib.request
+from collections.abc import Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -133,8 +134,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Keep the terminal free of a line a request."""
 
 
-def _pair(body: bytes, camera: StereoCamera) -> tuple[Image, Image]:
-    """Return the images of a request."""
+def _request(body: bytes) -> tuple[list[bytes], dict[str, float]]:
+    """Return the image files and the camera of a request, by the names of its numbers."""
     try:
         request = json.loads(body)
         texts = [request["left"], request["right"]]
@@ -154,12 +155,23 @@ def _pair(body: bytes, camera: StereoCamera) -> tuple[Image, Image]:
     ) as error:
         reason = 'give JSON with "left" and "right", image files in base64'
         raise _RefusedError(HTTPStatus.BAD_REQUEST, f"{reason} ({type(error).__name__})") from None
+    return data, given
+
+
+def _check_camera(given: Mapping[str, float], camera: StereoCamera) -> None:
+    """Refuse a camera that is not that of the map."""
     own = _camera_values(camera)
     for name, value in given.items():
         if not abs(value - own[name]) <= _SAME * abs(own[name]):
             raise _RefusedError(
                 HTTPStatus.CONFLICT, f"camera: {name} is {value:g}, that of the map {own[name]:g}"
             )
+
+
+def _pair(body: bytes, camera: StereoCamera) -> tuple[Image, Image]:
+    """Return the images of a request."""
+    data, given = _request(body)
+    _check_camera(given, camera)
     images: list[Image] = []
     shape: tuple[int | None, ...] | None = (
         None if camera.width is None else (camera.height, camera.width)

@@ -77,21 +77,23 @@ class EventQueue:
             self._add(call)
             return True
         with self._changed:
-            fits = True
-            while (
-                call.frame
-                and self._drop == "block"
-                and len(self._frames) >= self._most
-                and not self._closed
-            ):
-                self._changed.wait()
-            if call.frame and not self._closed:
-                if self._drop == "oldest" and len(self._frames) >= self._most:
-                    self._frames.popleft().make = None
-                    fits = False
-                self._frames.append(call)
+            fits = not call.frame or self._queue(call)
             self._add(call)
             return fits
+
+    def _queue(self, call: QueuedCall) -> bool:
+        """Add a frame to those that wait, once there is room, or for the oldest of them; False:
+        that one is left out.
+        """
+        while self._drop == "block" and len(self._frames) >= self._most and not self._closed:
+            self._changed.wait()
+        if self._closed:
+            return True
+        fits = self._drop != "oldest" or len(self._frames) < self._most
+        if not fits:
+            self._frames.popleft().make = None
+        self._frames.append(call)
+        return fits
 
     def _add(self, call: QueuedCall) -> None:
         if self._closed:

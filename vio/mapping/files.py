@@ -7,7 +7,7 @@ import logging
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.relative_pose import RelativePose
 from vio.mapping.density import spread
 from vio.mapping.map_database import check_path
-from vio.mapping.map_store import MapStore, SessionRow
+from vio.mapping.map_store import KeyframeRow, MapStore, SessionRow
 from vio.records import BoolArray, IntArray
 
 log = logging.getLogger(__name__)
@@ -37,11 +37,6 @@ def describe_map(path: Path) -> dict[str, Any]:
         keyframes = store.keyframes()
         loops = store.loops()
         earth = store.earth()
-        home = sessions[0].part if sessions else 0
-        own = [[k for k in keyframes if k.session == n] for n in range(len(sessions))]
-        positions = np.array(
-            [k.T_map_cam[:3, 3] for k in keyframes if sessions[k.session].part == home]
-        )
         return {
             "map": str(path),
             "version": store.version,
@@ -49,22 +44,40 @@ def describe_map(path: Path) -> dict[str, Any]:
             "keyframes": len(keyframes),
             "loops": sum(o.kept for o in loops),
             "loops_rejected": sum(not o.kept for o in loops),
-            "extent_m": np.ptp(positions, axis=0).tolist() if len(positions) else [0.0, 0.0, 0.0],
+            "extent_m": _extent_m(sessions, keyframes),
             "earth": None
             if earth is None
             else {"origin": earth.origin, "T_enu_map": earth.T_enu_map.tolist()},
-            "sessions": [
-                {
-                    "source": session.source,
-                    "keyframes": len(rows),
-                    "path_m": rows[-1].path_m - rows[0].path_m if rows else 0.0,
-                    "joined": session.part == home,
-                    "upright": session.upright,
-                    "camera": asdict(session.camera),
-                }
-                for session, rows in zip(sessions, own, strict=True)
-            ],
+            "sessions": _describe_sessions(sessions, keyframes),
         }
+
+
+def _extent_m(sessions: Sequence[SessionRow], keyframes: Sequence[KeyframeRow]) -> list[float]:
+    """Return the extent along x, y and z of the keyframes that are in the map's frame."""
+    own = [k for k in keyframes if sessions[k.session].part == sessions[0].part]
+    if not own:
+        return [0.0, 0.0, 0.0]
+    extent: list[float] = np.ptp([k.T_map_cam[:3, 3] for k in own], axis=0).tolist()
+    return extent
+
+
+def _describe_sessions(
+    sessions: Sequence[SessionRow], keyframes: Sequence[KeyframeRow]
+) -> list[dict[str, Any]]:
+    described = []
+    for n, session in enumerate(sessions):
+        own = [k for k in keyframes if k.session == n]
+        described.append(
+            {
+                "source": session.source,
+                "keyframes": len(own),
+                "path_m": own[-1].path_m - own[0].path_m if own else 0.0,
+                "joined": session.part == sessions[0].part,
+                "upright": session.upright,
+                "camera": asdict(session.camera),
+            }
+        )
+    return described
 
 
 def check_map(path: Path) -> dict[str, Any]:
@@ -184,8 +197,8 @@ def new_map(out: Path) -> Iterator[Path]:
 
 
 def _copy_rows(source: MapStore, store: MapStore, kept: BoolArray) -> None:
-    rows = source.keyframes()
     sessions = source.sessions()
+    rows = source.keyframes()
     owners = np.unique([rows[k].session for k in np.flatnonzero(kept).tolist()]).tolist()
     parts = [sessions[n].part for n in owners]
     for n in owners:
@@ -194,6 +207,25 @@ def _copy_rows(source: MapStore, store: MapStore, kept: BoolArray) -> None:
     if earth is not None and parts[0] == sessions[0].part:  # the frame is the same
         store.set_earth(earth)
     number = (np.cumsum(kept) - 1).tolist()
+    _copy_keyframes(source, store, kept, number, owners)
+    for loop in source.loops():
+        if kept[loop.first] and kept[loop.second]:
+            store.add_loop(replace(loop, first=number[loop.first], second=number[loop.second]))
+
+
+def _copy_keyframes(
+    source: MapStore, store: MapStore, kept: BoolArray, number: list[int], owners: list[int]
+) -> None:
+    """Copy the keyframes that are kept, with the motions between them.
+
+    Args:
+        source: a map.
+        store: the copy.
+        kept: (K,) keyframes of the map.
+        number: (K,) of those in the copy.
+        owners: sessions of the map that are in the copy.
+    """
+    rows = source.keyframes()
     motions = {second: motion for _, second, motion in source.odometry()}
     since: RelativePose | None = None  # the session's last keyframe that is kept
     for k, row in enumerate(rows):
@@ -206,6 +238,3 @@ def _copy_rows(source: MapStore, store: MapStore, kept: BoolArray) -> None:
             if since is not None:
                 store.add_odometry(number[k] - 1, number[k], since)
             since = RelativePose(np.eye(4), np.zeros((6, 6)))
-    for loop in source.loops():
-        if kept[loop.first] and kept[loop.second]:
-            store.add_loop(replace(loop, first=number[loop.first], second=number[loop.second]))

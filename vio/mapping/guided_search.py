@@ -242,11 +242,7 @@ def search(
     ):
         return None
     own = _of_one_segment(points, here, rows, agree)
-    weak = (
-        None
-        if prior is None
-        else RelativePose(prior.T_i_j, prior.covariance / _GUIDANCE.prior_share)
-    )
+    weak = _weakened(prior)
     terms = Terms(stereo.take(own), camera, here, rows[own], inverse=True)
     measured = fit_terms([terms], fitted.T_i_j, prior=weak, least=_GUIDANCE.min_sample)
     if measured is None:
@@ -434,6 +430,41 @@ class _Features(NamedTuple):
 
 
 @compiled
+def _distances(p: FloatArray, eye: FloatArray, here: FloatArray) -> tuple[float, float, bool]:
+    """Return how far a point is from where it was seen and from here, and whether it looks alike
+    from both: in direction and size.
+    """
+    dot = 0.0
+    away = 0.0
+    near = 0.0
+    for i in range(3):
+        there = p[i] - eye[i]
+        now = p[i] - here[i]
+        dot = dot + there * now
+        away = away + there * there
+        near = near + now * now
+    away = np.sqrt(away)
+    near = np.sqrt(near)
+    alike = dot > VIEW_COS * away * near and 1 / SCALES < away / near < SCALES
+    return away, near, alike
+
+
+@compiled
+def _largest_variance(D: FloatArray, C: FloatArray) -> float:
+    """Return the larger variance of a pixel's coordinates, by its Jacobian (2, 6) and the pose's
+    covariance (6, 6).
+    """
+    largest = 0.0
+    for r in range(2):
+        total = 0.0
+        for i in range(6):
+            for j in range(6):
+                total += D[r, i] * C[i, j] * D[r, j]
+        largest = max(largest, total)
+    return largest
+
+
+@compiled
 def _predict(
     points: _SeenFrom,
     pose: _Pose,
@@ -462,22 +493,8 @@ def _predict(
     for n in range(len(p)):
         for i in range(3):
             q[i] = T[i, 0] * p[n, 0] + T[i, 1] * p[n, 1] + T[i, 2] * p[n, 2] + T[i, 3]
-        dot = 0.0
-        away = 0.0
-        near = 0.0
-        for i in range(3):
-            there = p[n, i] - points.eye[n, i]
-            now = p[n, i] - pose.here[i]
-            dot = dot + there * now
-            away = away + there * there
-            near = near + now * now
-        away = np.sqrt(away)
-        near = np.sqrt(near)
-        if (
-            q[2] <= MIN_DEPTH_M
-            or dot <= VIEW_COS * away * near
-            or not 1 / SCALES < away / near < SCALES
-        ):
+        away, near, alike = _distances(p[n], points.eye[n], pose.here)
+        if q[2] <= MIN_DEPTH_M or not alike:
             continue
         u = cu + fu * q[0] / q[2]
         v = cv + fv * q[1] / q[2]
@@ -496,13 +513,7 @@ def _predict(
         D[1, 3] = b * (q[2] + y * q[1])
         D[1, 4] = -b * y * q[0]
         D[1, 5] = -b * q[0]
-        largest = 0.0
-        for r in range(2):
-            total = 0.0
-            for i in range(6):
-                for j in range(6):
-                    total += D[r, i] * C[i, j] * D[r, j]
-            largest = max(largest, total)
+        largest = _largest_variance(D, C)
         size[n] = size[n] * away / near
         half = _GUIDANCE.window_px * max(size[n], 1.0) + np.sqrt(largest)
         if (
@@ -547,6 +558,13 @@ def _corners(z: FloatArray) -> int:
     """Count the parts of the image that features (P, 4) are in."""
     cell = (z[:, :2] // _GUIDANCE.cell_px).astype(np.int64)
     return len(np.unique(cell[:, 0] * _GUIDANCE.rows + cell[:, 1]))
+
+
+def _weakened(prior: RelativePose | None) -> RelativePose | None:
+    """Return the prior with the covariance that decides what the pixels leave open."""
+    if prior is None:
+        return None
+    return RelativePose(prior.T_i_j, prior.covariance / _GUIDANCE.prior_share)
 
 
 def _chance(pairs: _Pairs, target: _Target) -> float:

@@ -458,6 +458,21 @@ class _Target(NamedTuple):
 
 
 @compiled
+def _pixel_covariance(
+    M: FloatArray, P: FloatArray, variance: float, rows: int, C: FloatArray
+) -> None:
+    """Write the lower triangle of the covariance of the first pixels (3,) of a point, by its own
+    (3, 3), the pixels' Jacobian by the point and their variance.
+    """
+    for i in range(rows):
+        for j in range(i + 1):
+            C[i, j] = variance if i == j else 0.0
+            for a in range(3):
+                for b in range(3):
+                    C[i, j] += M[i, a] * P[a, b] * M[j, b]
+
+
+@compiled
 def _add_pairs(
     pairs: _Pairs,
     target: _Target,
@@ -480,12 +495,7 @@ def _add_pairs(
             continue
         rows = 3 if pairs.stereo[k] else 2  # of a left pixel alone, two
         _linearise(p[k], q, pairs.z[k], target, A, M)
-        for i in range(rows):
-            for j in range(i + 1):
-                C[i, j] = pairs.variance[k] if i == j else 0.0
-                for a in range(3):
-                    for b in range(3):
-                        C[i, j] += M[i, a] * pairs.P[k, a, b] * M[j, b]
+        _pixel_covariance(M, pairs.P[k], pairs.variance[k], rows, C)
         _whiten(C, A, rows)
         total = 0.0
         for i in range(rows):
@@ -516,6 +526,22 @@ def _whiten(C: FloatArray, A: FloatArray, rows: int) -> None:
 
 
 @compiled
+def _compare_pixels(
+    q: FloatArray, z: FloatArray, target: _Target, A: FloatArray, z_D_q: FloatArray
+) -> None:
+    """Write the residuals of pixels [ul vl ur] into the last column of A (3, 7), and their Jacobian
+    (3, 3) by the point in the target.
+    """
+    fu, fv, cu, cv, baseline = target.camera
+    for i in range(3):
+        f = fv if i == 1 else fu
+        across = q[1] if i == 1 else q[0] - (baseline if i == 2 else 0.0)
+        z_D_q[i, 1 if i == 1 else 0] = f / q[2]
+        z_D_q[i, 2] = -f * across / q[2] ** 2
+        A[i, 6] = z[i] - (cv if i == 1 else cu) - f * across / q[2]
+
+
+@compiled
 def _linearise(
     p: FloatArray, q: FloatArray, z: FloatArray, target: _Target, A: FloatArray, M: FloatArray
 ) -> None:
@@ -525,15 +551,9 @@ def _linearise(
     `q = exp(-xi) T_hat^-1 p` if `inverse`, else `q = T_hat exp(xi) p`: its derivative is [-I, q^]
     or R [I, -p^].
     """
-    fu, fv, cu, cv, baseline = target.camera
     T = target.T
     z_D_q = np.zeros((3, 3))
-    for i in range(3):
-        f = fv if i == 1 else fu
-        across = q[1] if i == 1 else q[0] - (baseline if i == 2 else 0.0)
-        z_D_q[i, 1 if i == 1 else 0] = f / q[2]
-        z_D_q[i, 2] = -f * across / q[2] ** 2
-        A[i, 6] = z[i] - (cv if i == 1 else cu) - f * across / q[2]
+    _compare_pixels(q, z, target, A, z_D_q)
     for i in range(3):
         for c in range(3):
             M[i, c] = z_D_q[i, 0] * T[0, c] + z_D_q[i, 1] * T[1, c] + z_D_q[i, 2] * T[2, c]

@@ -142,32 +142,12 @@ class MapDatabase(ABC):
         if not create and not path.is_file():
             raise DataError(f"{path}: there is no such map; vio run --map {path} makes one")
         with contextlib.ExitStack() as undo, self._errors():
-            if read_only:
-                uri = f"{path.absolute().as_uri()}?mode=ro"
-                self._db = sqlite3.connect(uri, uri=True, check_same_thread=False, timeout=1.0)
-            else:
-                self._db = sqlite3.connect(path, check_same_thread=False, timeout=1.0)
+            self._db = _connect(path, read_only=read_only)
             undo.callback(self._db.close)
             self._db.isolation_level = None
             self._db.create_function("row_crc32", -1, _row_crc32, deterministic=True)
             self._db.set_progress_handler(self._is_late, _STEP)
-            empty = not self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-            if empty and create:
-                self._db.executescript(
-                    f"BEGIN; PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = "
-                    f"{VERSION}; "
-                    f"{_SCHEMA} COMMIT;"
-                )
-            elif self._pragma("application_id") != APPLICATION_ID:
-                raise DataError(
-                    f"{path}: is no map of this program; give a file that vio run --map wrote"
-                )
-            elif not _OLDEST <= self._pragma("user_version") <= VERSION:
-                raise DataError(
-                    f"{path}: is a map of version {self._pragma('user_version')}, this program "
-                    f"reads {VERSION}; use "
-                    "the program that wrote it, or build the map again"
-                )
+            self._make_or_recognise(path, create=create)
             self._db.execute("BEGIN")  # one state of the file, whatever another process commits
             # rows that were read to check them, until they are asked for
             self._checked: dict[str, list[Any]] = {}
@@ -328,33 +308,61 @@ class MapDatabase(ABC):
             return checked
         with self._errors():
             rows = self._db.execute(f"SELECT * FROM {table} {which} ORDER BY {key}").fetchall()
-        signed = self.version >= SINCE["crc32"]
         columns = self._columns(table)
-        if signed:
+        if self.version >= SINCE["crc32"]:
             columns = columns[:-1]
-            for row in rows:
-                if row[-1] != _row_crc32(*row[:-1]):
-                    raise self._bad_row(
-                        table, row[0], "its checksum does not agree with its content"
-                    )
-        if (
-            key == "id"
-            and (lost := next((n for n, row in enumerate(rows) if row[0] != n), None)) is not None
-        ):
-            raise self._bad_row(table, rows[lost][0], f"row {lost} is missing")
-        values: list[Any] = list(zip(*rows, strict=True)) if rows else [[] for _ in columns]
-        for n, name in enumerate(columns):
-            if name in _SHAPES:
-                values[n], fault = _arrays(values[n], _SHAPES[name])
-                if fault is not None:
-                    raise self._bad_row(table, rows[fault[0]][0], fault[1])
+            self._check_sums(table, rows)
+        if key == "id":
+            self._check_numbers(table, rows)
         out = []
-        for row in zip(*values[: len(columns)], strict=True):
+        for row in zip(*self._values(table, columns, rows), strict=True):
             try:
                 out.append(made(*row))
             except (ValueError, TypeError) as error:
                 raise self._bad_row(table, row[0], error) from error
         return out
+
+    def _check_sums(self, table: str, rows: list[Any]) -> None:
+        for row in rows:
+            if row[-1] != _row_crc32(*row[:-1]):
+                raise self._bad_row(table, row[0], "its checksum does not agree with its content")
+
+    def _check_numbers(self, table: str, rows: list[Any]) -> None:
+        for n, row in enumerate(rows):
+            if row[0] != n:
+                raise self._bad_row(table, row[0], f"row {n} is missing")
+
+    def _values(self, table: str, columns: list[str], rows: list[Any]) -> list[Any]:
+        """Return the columns of rows, with arrays where they hold some."""
+        if not rows:
+            return [[] for _ in columns]
+        values: list[Any] = list(zip(*rows, strict=True))[: len(columns)]
+        for n, name in enumerate(columns):
+            if name in _SHAPES:
+                values[n], fault = _arrays(values[n], _SHAPES[name])
+                if fault is not None:
+                    raise self._bad_row(table, rows[fault[0]][0], fault[1])
+        return values
+
+    def _make_or_recognise(self, path: Path, *, create: bool) -> None:
+        """Write the tables into an empty file, if it may be made; else check that it is a map of a
+        version that is read.
+        """
+        empty = not self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+        if empty and create:
+            self._db.executescript(
+                f"BEGIN; PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = "
+                f"{VERSION}; {_SCHEMA} COMMIT;"
+            )
+        elif self._pragma("application_id") != APPLICATION_ID:
+            raise DataError(
+                f"{path}: is no map of this program; give a file that vio run --map wrote"
+            )
+        elif not _OLDEST <= self._pragma("user_version") <= VERSION:
+            raise DataError(
+                f"{path}: is a map of version {self._pragma('user_version')}, this program "
+                f"reads {VERSION}; use the program that wrote it, or build the map again"
+            )
 
     def _bad_row(self, table: str, number: object, fault: object) -> DataError:
         return damaged(self.path, f"row {number} of {table}: {fault}")
@@ -366,6 +374,11 @@ class MapDatabase(ABC):
         Raises:
             DataError: they do not.
         """
+
+
+def _connect(path: Path, *, read_only: bool) -> sqlite3.Connection:
+    target = f"{path.absolute().as_uri()}?mode=ro" if read_only else path
+    return sqlite3.connect(target, uri=read_only, check_same_thread=False, timeout=1.0)
 
 
 def _schema_of(database: sqlite3.Connection) -> set[tuple[Any, ...]]:

@@ -197,22 +197,25 @@ class MapStore(MapDatabase):
         def between(first: int, second: int, pose: RelativePose) -> RelativePose:
             return RelativePose(se3_inverse(T_map_cam[first]) @ T_map_cam[second], pose.covariance)
 
+        def both_moved(first: int, second: int) -> bool:
+            return first in T_map_cam and second in T_map_cam
+
         upright = {k: row.up_cam is not None for k, row in enumerate(self.keyframes())}
         ups = {k: (_blob(T[2, :3]),) for k, T in T_map_cam.items() if upright[k]}
-        motions = [row for row in self.odometry() if row[0] in T_map_cam and row[1] in T_map_cam]
+        motions = {
+            second: (_blob(between(first, second, motion).T_i_j),)
+            for first, second, motion in self.odometry()
+            if both_moved(first, second)
+        }
         loops = {
-            n: o
+            n: replace(o, pose=between(o.first, o.second, o.pose))
             for n, o in enumerate(self.loops())
-            if o.kept and o.first in T_map_cam and o.second in T_map_cam
+            if o.kept and both_moved(o.first, o.second)
         }
         self.set_poses(T_map_cam)
         self._set("keyframes", ("up_cam",), ups)
-        self._set(
-            "odometry", ("T_i_j",), {row[1]: (_blob(between(*row).T_i_j),) for row in motions}
-        )
-        self.set_loops(
-            {n: replace(o, pose=between(o.first, o.second, o.pose)) for n, o in loops.items()}
-        )
+        self._set("odometry", ("T_i_j",), motions)
+        self.set_loops(loops)
 
     def set_kept(self, kept: Mapping[int, bool]) -> None:
         """Say of loops whether they agree with the others."""

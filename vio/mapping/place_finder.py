@@ -220,31 +220,37 @@ class PlaceFinder:
         expected = self._search(number, features, allowed)
         if expected is not None:
             return expected
-        found: list[FoundPlace] = []
-        for i in self._index.candidates(
-            features.descriptors, allowed, _FINDING.candidates
-        ).tolist():
-            camera = self._graph.sessions[int(self._graph.session[i])].camera
-            seen = verify(camera, self.features(i), self._camera, features)
-            if seen is not None and self.fits(i, number, seen, drift[i]):
-                lost = (
-                    drift[i, :3, :3].trace() > _FINDING.lost_m**2
-                    and seen.inliers < _FINDING.sure_inliers
-                )
-                found.append(
-                    FoundPlace(
-                        i,
-                        number,
-                        seen,
-                        _FINDING.confirmations_lost if lost else _FINDING.confirmations,
-                    )
-                )
+        found = self._candidates(number, features, allowed, drift)
         if not found:
             return None
         best = max(found, key=lambda loop: loop.seen.inliers)
         if any(self._is_rival(other, best, depth) for other in found):
             return None
         return self._refined(best, features, drift[best.first])
+
+    def _candidates(
+        self, number: int, features: KeyframeFeatures, allowed: BoolArray, drift: FloatArray
+    ) -> list[FoundPlace]:
+        """Return the similar keyframes that fit by geometry and odometry.
+
+        Args:
+            number: of the keyframe that is looked for.
+            features: what it shows.
+            allowed: (K,) keyframes that may be found.
+            drift: (K, 6, 6) covariance of the odometry since each of them.
+        """
+        candidates = self._index.candidates(features.descriptors, allowed, _FINDING.candidates)
+        found: list[FoundPlace] = []
+        for i in candidates.tolist():
+            camera = self._graph.sessions[int(self._graph.session[i])].camera
+            seen = verify(camera, self.features(i), self._camera, features)
+            if seen is None or not self.fits(i, number, seen, drift[i]):
+                continue
+            far = drift[i, :3, :3].trace() > _FINDING.lost_m**2
+            lost = far and seen.inliers < _FINDING.sure_inliers
+            needed = _FINDING.confirmations_lost if lost else _FINDING.confirmations
+            found.append(FoundPlace(i, number, seen, needed))
+        return found
 
     def _refined(
         self, loop: FoundPlace, features: KeyframeFeatures, drift: FloatArray

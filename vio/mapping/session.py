@@ -185,40 +185,23 @@ class MapSession:
         """
         self._frames += 1
         self._T_odom_body = estimate.T_world_imu
+        self._take_calibration(estimate)
+        self._release(relative)
+        events = self._take(lambda due, done: due <= self._frames and (done or self._wait))
+        fresh = seen.take(seen.has_right & ~seen.stale)
+        motion = self._follow(frame, len(fresh), estimate, relative)
+        self._most_features = max(self._most_features, len(fresh))
+        if len(fresh) >= min(_CHOICE.min_features, 0.5 * self._most_features):
+            self._consider(frame, fresh.ids, estimate, motion)
+        return events
+
+    def _take_calibration(self, estimate: Estimate) -> None:
         if estimate.stereo_field is not None:
             self._field = DisplacementField.of(self._camera, estimate.stereo_field)
         scale = estimate.stereo_scale
         self.scale_sigma = (
             self._rig_sigmas[0] if scale is None else float(np.sqrt(scale.covariance.sum()))
         )
-        self._release(relative)
-        events = self._take(lambda due, done: due <= self._frames and (done or self._wait))
-        fresh = seen.take(seen.has_right & ~seen.stale)
-        seen_now = len(fresh) >= _CHOICE.min_tracked
-        lost = seen_now and self._is_lost(frame.time_ns)
-        motion = self._motion_to(frame.index, estimate, _unknown if lost else relative)
-        self._dark = (
-            _predicted(self._seen, estimate) if motion is None and self._seen is not None else None
-        )
-        if self._dark is not None and self._is_lost(frame.time_ns):
-            self._dark = RelativePose(self._dark.T_i_j, np.diag(_BROKEN))
-        if seen_now:
-            self._seen_ns = frame.time_ns
-            self._seen = estimate
-        self._most_features = max(self._most_features, len(fresh))
-        if (
-            len(fresh) < min(_CHOICE.min_features, 0.5 * self._most_features)
-            or frame.left is None
-            or frame.right is None
-        ):
-            return events
-        self._since += 1
-        if motion is None and self._newest is not None:
-            return events
-        busy = not self._wait and len(self._waiting) + len(self._held) >= _MAX_WAITING
-        if not busy and self._is_due(fresh.ids, motion):
-            self._hold(frame, fresh.ids, estimate, motion)
-        return events
 
     def finish(self) -> tuple[LoopEvent, ...]:
         """Wait for everything, and write the map."""
@@ -380,6 +363,39 @@ class MapSession:
         self._newest = frame, total, T_odom_cam
         return total
 
+    def _follow(
+        self, frame: StereoFrame, features: int, estimate: Estimate, relative: Relative
+    ) -> RelativePose | None:
+        """Return the camera's motion since the last keyframe as `_motion_to` does, and keep what is
+        known of a frame that shows too few features.
+        """
+        is_lost = self._is_lost(frame.time_ns)
+        seen_now = features >= _CHOICE.min_tracked
+        motion = self._motion_to(
+            frame.index, estimate, _unknown if seen_now and is_lost else relative
+        )
+        self._dark = None
+        if motion is None and self._seen is not None:
+            dark = _predicted(self._seen, estimate)
+            self._dark = RelativePose(dark.T_i_j, np.diag(_BROKEN)) if is_lost else dark
+        if seen_now:
+            self._seen_ns = frame.time_ns
+            self._seen = estimate
+        return motion
+
+    def _consider(
+        self, frame: StereoFrame, ids: IntArray, estimate: Estimate, motion: RelativePose | None
+    ) -> None:
+        """Make a frame that shows enough a keyframe, where one is due."""
+        if frame.left is None or frame.right is None:
+            return
+        self._since += 1
+        if motion is None and self._newest is not None:
+            return
+        busy = not self._wait and len(self._waiting) + len(self._held) >= _MAX_WAITING
+        if not busy and self._is_due(ids, motion):
+            self._hold(frame, ids, estimate, motion)
+
     def _is_due(self, ids: IntArray, motion: RelativePose | None) -> bool:
         """Whether a frame becomes a keyframe: it shows little of what the last one showed."""
         if motion is None:
@@ -420,28 +436,26 @@ class MapSession:
 
         The filter may accept a single wrong image and correct the pose with the next ones.
         """
-        for held in self._held:
-            motion = (
-                None
-                if relative is None or held.anchor is None
-                else relative(held.anchor, held.keyframe.frame)
-            )
-            if motion is not None:
-                motion = motion.seen_by(self._T_cam_body)
-                held.motions.append(
-                    _inflated(motion if held.base is None else held.base.then(motion))
-                )
+        if relative is not None:
+            for held in self._held:
+                self._add_motion(held, relative)
         while self._held and (relative is None or self._held[0].due <= self._frames):
-            held = self._held.pop(0)
-            keyframe = replace(
-                held.keyframe, motion=_middle(held.motions) if held.motions else None
-            )
-            result = self._executor.submit(_add, self._builder, keyframe, self._features.pop(0))
-            self._waiting.append(
-                (held.due + HANDOVER_FRAMES - SETTLED_FRAMES, keyframe.frame, result)
-            )
-            if keyframe.motion is not None:
-                self._moves.append((keyframe.frame, keyframe.motion))
+            self._hand_over(self._held.pop(0))
+
+    def _add_motion(self, held: _Held, relative: Relative) -> None:
+        motion = None if held.anchor is None else relative(held.anchor, held.keyframe.frame)
+        if motion is None:
+            return
+        motion = motion.seen_by(self._T_cam_body)
+        held.motions.append(_inflated(motion if held.base is None else held.base.then(motion)))
+
+    def _hand_over(self, held: _Held) -> None:
+        keyframe = replace(held.keyframe, motion=_middle(held.motions) if held.motions else None)
+        result = self._executor.submit(_add, self._builder, keyframe, self._features.pop(0))
+        due = held.due + HANDOVER_FRAMES - SETTLED_FRAMES
+        self._waiting.append((due, keyframe.frame, result))
+        if keyframe.motion is not None:
+            self._moves.append((keyframe.frame, keyframe.motion))
 
     def _vertical(self, estimate: Estimate) -> tuple[FloatArray | None, float]:
         """Direction against gravity in the camera (3,) and its standard deviation.

@@ -100,6 +100,11 @@ class Evidence:
         """Whether there are fewer intervals than in any evaluation during a run."""
         return self.gyro_fit.count < FIRST_EVALUATION
 
+    @property
+    def gyro_agrees(self) -> bool:
+        """Whether the gyro explains the camera's rotations by some linear map."""
+        return self.gyro_fit.unexplained < AGREES
+
 
 @dataclass(frozen=True, slots=True)
 class _Window:

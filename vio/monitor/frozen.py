@@ -164,26 +164,44 @@ class FrozenImages:
         before = _images(shown)
         if [image.shape for image in images] != [image.shape for image in before]:
             return None  # the front end refuses it
-        again = self._repeating is not None  # what was given again once is, until it changes
         if all(_equal(new, old) for new, old in zip(images, before, strict=True)):
-            if again or self._moves(expected):
-                return Repeated(shown.index, True)
-            self._still = self._still or (frame.index, self._flow_px())
-            return None
+            return self._judge_equal(frame, shown, expected)
+        return self._judge_changed(frame, shown, expected)
+
+    def _judge_equal(
+        self, frame: StereoFrame, shown: StereoFrame, expected: Prediction | None
+    ) -> Repeated | None:
+        """Judge a frame of the same images as the last one, as a rig at standstill shows them."""
+        # what was given again once is, until it changes
+        if self._repeating is not None or self._moves(expected):
+            return Repeated(shown.index, True)
+        self._still = self._still or (frame.index, self._flow_px())
+        return None
+
+    def _judge_changed(
+        self, frame: StereoFrame, shown: StereoFrame, expected: Prediction | None
+    ) -> Repeated | None:
+        """Judge a frame whose images differ from the last ones: perhaps by their noise alone."""
         self._ended_still = self._still
         self._still = None
         if self._seen is None or expected is None:
             return None
-        if again:
-            return Repeated(shown.index, False) if _unmoved(shown, frame, self._seen) else None
-        if len(self._errors_px) < _MIN_RECENT or not self._contradicts(expected.motion):
-            return None
-        moving = _predicted_to_move(
-            self._seen, expected, max(_PREDICTED_PX, _ERRORS * max(self._errors_px))
-        )
-        # The IMU comes last, as nearly every new frame has moved.
-        frozen = _unmoved(shown, frame, moving) and not self._at_standstill()
+        if self._repeating is not None:
+            frozen = _unmoved(shown, frame, self._seen)
+        else:
+            frozen = self._has_stopped(frame, shown, self._seen, expected)
         return Repeated(shown.index, False) if frozen else None
+
+    def _has_stopped(
+        self, frame: StereoFrame, shown: StereoFrame, seen: Observations, expected: Prediction
+    ) -> bool:
+        """Whether features that the prediction moves stay where they were, while the rig moves."""
+        if len(self._errors_px) < _MIN_RECENT or not self._contradicts(expected.motion):
+            return False
+        predicted_px = max(_PREDICTED_PX, _ERRORS * max(self._errors_px))
+        moving = _predicted_to_move(seen, expected, predicted_px)
+        # The IMU comes last, as nearly every new frame has moved.
+        return _unmoved(shown, frame, moving) and not self._at_standstill()
 
     def _moves(self, expected: Prediction | None) -> bool:
         """Whether the rig moves: by the last frames' features, the IMU's samples, else by the

@@ -48,9 +48,18 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
         return _judge_scale(evidence, R)
     if not evidence.force_final:
         return []
+    return _name_mistake(evidence, unit)
+
+
+def _name_mistake(evidence: Evidence, unit: float) -> list[InertialFinding]:
+    """Return which mistake in the given rotation, which does not fit, explains the gyro's rates;
+    nothing where that stays open.
+    """
+    gyro_fit = evidence.gyro_fit
+    R = evidence.R_cam0_imu
     seen = _contradiction(gyro_fit, R)
     likely = _explanations(R, gyro_alone=_gyro_alone(evidence, unit))
-    uncertain = brief or evidence.clipped
+    uncertain = evidence.brief or evidence.clipped
     # A bias that jumps, or a mount that has turned a little, is explained by some rotation, too.
     far = gyro_fit.excess(R, max(gyro_fit.scale(R), 0.0)) > _DISAGREES
     for mistake in chain(likely, () if uncertain else _free_explanations(gyro_fit.S_cg)):

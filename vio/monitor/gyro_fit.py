@@ -108,12 +108,17 @@ def fit_gyro(record: Record, least: int, noise_radps: float | None = None) -> Gy
     if best is None or best.axes == 0:
         return None
     if best.unexplained > AGREES:
-        far = _at_offset(record, FAR_OFFSETS_S, max(least, len(omega) // 2), noise)
-        best = far if far is not None and far.unexplained < 0.5 * best.unexplained else best
+        best = _search_far(record, best, least, noise)
     for step in (0.01, 0.003):
         near = _at_offset(record, best.offset_s + step * np.arange(-2, 3), least, noise)
         best = near if near is not None and near.unexplained <= best.unexplained else best
     return best if best.axes else None
+
+
+def _search_far(record: Record, near: GyroFit, least: int, noise: float) -> GyroFit:
+    """Return the fit at a clock offset of seconds where it explains far more than the near one."""
+    far = _at_offset(record, FAR_OFFSETS_S, max(least, len(record.twists) // 2), noise)
+    return far if far is not None and far.unexplained < 0.5 * near.unexplained else near
 
 
 def _at_offset(

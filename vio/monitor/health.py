@@ -317,8 +317,7 @@ class RefusalReport:
 
     def _cause(self, estimate: Estimate) -> str:
         """The likeliest cause by the evidence."""
-        ratios = [f.innovation_ratio for f in self._frames if f.innovation_ratio is not None]
-        ratio = median(ratios) if ratios else 0.0
+        ratio = self._innovation_ratio()
         if self.imu and ratio > _CONTRADICTED:
             return (
                 f"the images show features {ratio:.1f} standard deviations beside where the IMU "
@@ -340,6 +339,11 @@ class RefusalReport:
                 "calibrate the cameras (vio calibrate)"
             )
         return f"{where}blurred images, repeated texture, or many things that move"
+
+    def _innovation_ratio(self) -> float:
+        """How many standard deviations the features lie beside where they were predicted (median)."""
+        ratios = [f.innovation_ratio for f in self._frames if f.innovation_ratio is not None]
+        return median(ratios) if ratios else 0.0
 
     def _place(self) -> str | None:
         """Where in the image half of the refused features lie with few others.

@@ -19,7 +19,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.imu.clocks import SampleCoverage
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.force_fit import FIRST_EVALUATION, MIN_WINDOWS, Evidence, fit_force
-from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset, judge_stamps
+from vio.monitor.gyro_fit import GyroFit, fit_gyro, judge_offset, judge_stamps
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.monitor.rotation_comparison import compare_rotations, judge_rotations
 from vio.monitor.samples import Samples, Size, judge_size
@@ -149,14 +149,19 @@ class InertialCheck:
         record = record_of(motion, times_ns, values)
         gyro_fit = fit_gyro(record, _MIN_AT_END)
         if gyro_fit is None:
-            if self._seen >= _ENOUGH:
-                self.rotation_comparison = self.rotation_comparison or ROTATION_NOT_COMPARABLE
-                self.axes_compared = True
             return self._judge_stationary(size, record, last=last)
+        evidence = self._evidence(size, record, gyro_fit, last=last)
+        from vio.calibration.inertial import Rates
+
+        rates = Rates(times_ns, values[:, :3], values[:, 3:], True)
+        return self._judge_rotating(evidence, size, record, rates)
+
+    def _evidence(self, size: Size, record: Record, gyro_fit: GyroFit, *, last: bool) -> Evidence:
+        """Return what both sensors show beside the images."""
         early = None if size.unit is None else fit_force(record, gyro_fit, self._T[:3, 3])
         force = None if early is None or early.windows < MIN_WINDOWS else early
         self.axes_compared |= early is not None
-        evidence = Evidence(
+        return Evidence(
             R_cam0_imu=self._T[:3, :3],
             gyro_fit=gyro_fit,
             force=force,
@@ -166,15 +171,14 @@ class InertialCheck:
             clipped=self.clipped or "saturation" in self._reported,
             last=last,
         )
-        from vio.calibration.inertial import Rates
-
-        rates = Rates(times_ns, values[:, :3], values[:, 3:], True)
-        return self._judge_rotating(evidence, size, record, rates)
 
     def _judge_stationary(self, size: Size, record: Record, *, last: bool) -> list[InertialFinding]:
         """Judge without rotation: the magnitude of the readings and, at the end, the direction
         of gravity.
         """
+        if self._seen >= _ENOUGH:
+            self.rotation_comparison = self.rotation_comparison or ROTATION_NOT_COMPARABLE
+            self.axes_compared = True
         found = [] if size.finding is None else [size.finding]
         means, covered = record.means(np.zeros(1))
         if last and size.unit is not None and int(covered.sum()) >= _MIN_AT_END:
@@ -187,36 +191,57 @@ class InertialCheck:
         self, evidence: Evidence, size: Size, record: Record, rates: Rates
     ) -> list[InertialFinding]:
         """Judge with rotation, and decide whether the comparison may end."""
-        from vio.monitor.accelerometer import judge_force, judge_lever_arm, resolve_size
+        from vio.monitor.accelerometer import resolve_size
         from vio.monitor.gyro import judge_gyro
 
         gyro_fit = evidence.gyro_fit
-        last = evidence.last
         size = resolve_size(size, evidence)
+        rotation = judge_gyro(evidence, size.unit or 1.0)
+        found = self._judge_size_and_rates(size, record, gyro_fit, rotation)
+        forces, measured = self._judge_force(evidence, size, rotation)
+        found += forces
+        self.imu_at_fault |= _shows_fault(found, evidence)
+        force_is_settled = measured or size.unit is None or bool(rotation)
+        enough = force_is_settled and _has_enough_rotation(gyro_fit)
+        if measured and not found:
+            found = self._judge_lever_arm(evidence, record, rates, enough=enough)
+        self.done = enough and all(f.fault in self._suspected for f in found)
+        return found
+
+    def _judge_size_and_rates(
+        self, size: Size, record: Record, gyro_fit: GyroFit, rotation: list[InertialFinding]
+    ) -> list[InertialFinding]:
+        """Return what size, stamps and rates show; rotations are compared where none of them is
+        found wrong.
+        """
         offset = judge_offset(gyro_fit, record, _MIN_AT_END)
         found = [f for f in (size.finding, offset, judge_stamps(record)) if f is not None]
-        rotation = judge_gyro(evidence, size.unit or 1.0)
-        found += rotation
-        found += self._compare_rotations(record, gyro_fit) if not rotation else []
-        agrees = gyro_fit.unexplained < AGREES
-        measured = False
-        if size.unit is not None and agrees and all(f.fault == "gyro units" for f in rotation):
-            forces, measured = judge_force(evidence, size.unit, self._stereo)
-            found += forces
-        self.imu_at_fault |= any(f.certain and f.fault != "camera stamps" for f in found)
-        # whatever turns out to be the cause
-        self.imu_at_fault |= agrees and not gyro_fit.fits(evidence.R_cam0_imu)
-        enough = (
-            gyro_fit.count >= _ENOUGH
-            and gyro_fit.axes == 3
-            and (measured or size.unit is None or bool(rotation))
-        )
-        if not found and (last or enough) and agrees and measured:
-            found = judge_lever_arm(record, gyro_fit, self._T, rates)
-            if not last:
-                # at this stage, one evaluation suffices
-                self._suspected |= {f.fault for f in found}
-        self.done = enough and all(f.fault in self._suspected for f in found)
+        return found + (rotation or self._compare_rotations(record, gyro_fit))
+
+    def _judge_force(
+        self, evidence: Evidence, size: Size, rotation: Sequence[InertialFinding]
+    ) -> tuple[list[InertialFinding], bool]:
+        """Judge the accelerometer where the gyro's axes are known; return also whether it could be
+        measured.
+        """
+        from vio.monitor.accelerometer import judge_force
+
+        axes_known = all(f.fault == "gyro units" for f in rotation)
+        if size.unit is None or not evidence.gyro_agrees or not axes_known:
+            return [], False
+        return judge_force(evidence, size.unit, self._stereo)
+
+    def _judge_lever_arm(
+        self, evidence: Evidence, record: Record, rates: Rates, *, enough: bool
+    ) -> list[InertialFinding]:
+        """Judge the IMU's place on the camera at the end, for which one evaluation suffices."""
+        from vio.monitor.accelerometer import judge_lever_arm
+
+        if not (evidence.last or enough):
+            return []
+        found = judge_lever_arm(record, evidence.gyro_fit, self._T, rates)
+        if not evidence.last:
+            self._suspected |= {f.fault for f in found}
         return found
 
     def _compare_first_rotations(self) -> None:
@@ -250,3 +275,14 @@ class InertialCheck:
                 self._reported.add(finding.group)
                 out.append(finding)
         return tuple(out)
+
+
+def _has_enough_rotation(gyro_fit: GyroFit) -> bool:
+    return gyro_fit.count >= _ENOUGH and gyro_fit.axes == 3
+
+
+def _shows_fault(found: Sequence[InertialFinding], evidence: Evidence) -> bool:
+    """Whether the IMU is at fault, whatever turns out to be the cause."""
+    if any(f.certain and f.fault != "camera stamps" for f in found):
+        return True
+    return evidence.gyro_agrees and not evidence.gyro_fit.fits(evidence.R_cam0_imu)

@@ -328,6 +328,11 @@ class RunMonitor:
                 findings = tuple(f for f in findings if f.group != "overlap")
             self._report_findings(findings)
         self._report_scale(last=True)
+        self._report_no_pose()
+        self._integrity.close(self._index)
+
+    def _report_no_pose(self) -> None:
+        """Say why the last frames have no pose, if they have none."""
         if self._waiting_since is not None:
             why = (
                 "correct the fault of the IMU that is named above first"
@@ -336,7 +341,6 @@ class RunMonitor:
             )
             line = f"one camera: {self.frames_waiting} frames have no pose; {why}"
             self._report("no-pose", [line])
-        self._integrity.close(self._index)
 
     def _report_findings(self, findings: Iterable[InertialFinding]) -> None:
         """Log findings; gaps are reported one by one by `ImuSilence`."""

@@ -122,16 +122,8 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
         for extreme in (values[:, axis].max(), values[:, axis].min()):
             at = values[:, axis] == extreme
             # no sensor's range ends at 0: that of a simulator without noise, at rest
-            if extreme == 0.0 or at.sum() < _MIN_RUN or at.all():
-                continue
-            if _has_no_noise(values, at, axis):
-                continue
-            # Equal neighbours elsewhere are due to chance: a run of n has the probability
-            # held^(n-1).
-            held = float(np.mean(equal[~(at[1:] & at[:-1]), axis]))
-            chance = np.log(_MIN_CHANCE) / np.log(held) if held > 0 else 0.0
-            run = _longest_run(at)
-            if run < max(_MIN_RUN, 1 + chance) or len(np.unique(values[:, axis])) < _MIN_LEVELS:
+            run = 0 if extreme == 0.0 else _run_at_end(values, equal, at, axis)
+            if run == 0:
                 continue
             name, unit = ("gyro", "rad/s") if axis < 3 else ("accelerometer", "m/s^2")
             yield InertialFinding(
@@ -143,6 +135,26 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
                 "there",
             )
             return
+
+
+def _run_at_end(values: FloatArray, equal: BoolArray, at: BoolArray, axis: int) -> int:
+    """Return for how many readings in a row an axis is at the end of its range; 0: it is not.
+
+    Args:
+        values: (S, 6) readings.
+        equal: (S - 1, 6) which are those of the reading before.
+        at: (S,) whether the axis is at its extreme.
+        axis: of gyro and accelerometer.
+    """
+    if at.sum() < _MIN_RUN or at.all() or _has_no_noise(values, at, axis):
+        return 0
+    # Equal neighbours elsewhere are due to chance: a run of n has the probability held^(n-1).
+    held = float(np.mean(equal[~(at[1:] & at[:-1]), axis]))
+    chance = np.log(_MIN_CHANCE) / np.log(held) if held > 0 else 0.0
+    run = _longest_run(at)
+    if run < max(_MIN_RUN, 1 + chance) or len(np.unique(values[:, axis])) < _MIN_LEVELS:
+        return 0
+    return run
 
 
 def _has_no_noise(values: FloatArray, at: BoolArray, axis: int) -> bool:
@@ -204,19 +216,9 @@ def _judge_median(usual: float, spread: float) -> Size:
     seen = (
         f"the accelerometer's median magnitude is {usual:.4g} where gravity alone gives 9.8 m/s^2"
     )
-    units = {
-        1.0: "in g: multiply by 9.81",
-        _MILLI_G: "in mg (multiply by 0.00981) or in cm/s^2 (divide by 100)",
-        9807.0: "in mm/s^2: divide by 1000",
-    }
-    for gravity, explanation in units.items():
-        if 0.6 < usual / gravity < 1.6 and spread < 0.3:
-            factor = None if gravity == _MILLI_G else _GRAVITY / gravity  # of which there are two
-            finding = InertialFinding(
-                "accelerometer units", seen, f"the readings are {explanation}", factor=factor
-            )
-            clear = gravity > 1.0 or (abs(usual - 1.0) < 0.1 and spread < 0.06)
-            return Size(finding, _GRAVITY / gravity, clear)
+    named = _named_unit(usual, spread, seen)
+    if named is not None:
+        return named
     if usual < 0.5 * _GRAVITY and (spread >= 0.3 or usual < 0.5):
         return Size(gravity_removed(f"{seen}, and it varies by {100 * spread:.0f} %"), None)
     finding = InertialFinding(
@@ -225,6 +227,26 @@ def _judge_median(usual: float, spread: float) -> Size:
         f"the unit or scale is unknown; a factor of {_GRAVITY / usual:.4g} would make it 9.8",
     )
     return Size(finding, _GRAVITY / usual, usual > 0.5 * _GRAVITY)
+
+
+def _named_unit(usual: float, spread: float, seen: str) -> Size | None:
+    """Return the judgement of a steady magnitude that is gravity in another unit; None: it is not."""
+    if not spread < 0.3:
+        return None
+    units = {
+        1.0: "in g: multiply by 9.81",
+        _MILLI_G: "in mg (multiply by 0.00981) or in cm/s^2 (divide by 100)",
+        9807.0: "in mm/s^2: divide by 1000",
+    }
+    for gravity, explanation in units.items():
+        if 0.6 < usual / gravity < 1.6:
+            factor = None if gravity == _MILLI_G else _GRAVITY / gravity  # of which there are two
+            finding = InertialFinding(
+                "accelerometer units", seen, f"the readings are {explanation}", factor=factor
+            )
+            clear = gravity > 1.0 or (abs(usual - 1.0) < 0.1 and spread < 0.06)
+            return Size(finding, _GRAVITY / gravity, clear)
+    return None
 
 
 def gravity_removed(seen: str) -> InertialFinding:

@@ -142,6 +142,10 @@ def _load_extension() -> tuple[ModuleType, Mapping[str, Mapping[str, Any]]]:
         raise _UnusableError(f"this processor has no {' '.join(sorted(lacking))}")
     if not is_whole:
         raise _UnusableError(f"{file.name} is damaged; install again")
+    return _import(file), loops
+
+
+def _import(file: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(MODULE, file)
     assert spec is not None
     assert spec.loader is not None
@@ -150,7 +154,7 @@ def _load_extension() -> tuple[ModuleType, Mapping[str, Mapping[str, Any]]]:
         spec.loader.exec_module(module)
     except ImportError as error:  # it asks for newer libraries
         raise _UnusableError(str(error)) from error
-    return module, loops
+    return module
 
 
 def is_usable() -> bool:

@@ -126,6 +126,37 @@ class _Matches:
     z: FloatArray  # (N, 4) rectified pixels [ul vl ur vr]; empty where images cannot be rectified
 
 
+def _notes(source: CalibrationSource) -> tuple[str, ...]:
+    if source.rejection is None:
+        return ()
+    return (f"the reader rejects this calibration: {source.rejection}",)
+
+
+def _judge_exchange_or_stereo(
+    matches: _Matches,
+    stereo: StereoEstimate | NotObservable,
+    given: FloatArray,
+    agreeing: RayMatches,
+) -> tuple[Finding, ...]:
+    """Judge whether the cameras are exchanged; where they are not, the given extrinsics."""
+    findings: tuple[Finding, ...] = ()
+    if matches.exchanged is not None:
+        findings = judge_exchange(matches.rays, matches.exchanged, given)
+    if not findings and isinstance(stereo, StereoEstimate):
+        findings = judge_stereo(stereo, given, agreeing)
+    return findings
+
+
+def _fault_of_rows(rows: RowResiduals | NotObservable, findings: tuple[Finding, ...]) -> str | None:
+    """Return the fault for which features may not be of the same point; None: there is none."""
+    misaligned = isinstance(rows, RowResiduals) and (
+        abs(rows.median_px) + rows.spread_px > _MAX_ROW_OFFSET_PX
+    )
+    if not misaligned and not any(f.fault in _UNUSABLE for f in findings):
+        return None
+    return findings[0].fault if findings else "image rows do not match"
+
+
 def measure(
     source: CalibrationSource,
     build_frontend: Callable[[Dataset], Frontend],
@@ -146,36 +177,25 @@ def measure(
     Raises:
         VioError: the recording cannot be read.
     """
-    notes = (
-        ()
-        if source.rejection is None
-        else (f"the reader rejects this calibration: {source.rejection}",)
-    )
+    notes = _notes(source)
+    tracked = None
     if source.raw_pairs:
         matches = _match_images(source, pairs, progress)
-        tracked = None
     else:
         assert source.dataset is not None
         tracked = track(source.dataset, build_frontend, frames)
         matches = _match_tracks(source.dataset.recording, tracked[0], pairs)
     given = source.T_cam0_cam1
     stereo, agreeing = _measure_stereo(matches.rays)
-    findings = (
-        () if matches.exchanged is None else judge_exchange(matches.rays, matches.exchanged, given)
-    )
-    if not findings and isinstance(stereo, StereoEstimate):
-        findings = judge_stereo(stereo, given, agreeing)
+    findings = _judge_exchange_or_stereo(matches, stereo, given, agreeing)
     if source.dataset is None:
         rows = NotObservable(_ROWS, "the images cannot be rectified")
         why = "the left-right calibration must be corrected first: it determines the positions and depths of features"
         return CalibrationReport(source, stereo, rows, _no_imu(why), findings, notes)
     described = row_residuals(matches.z, *source.image_size(matches.z))
-    misaligned = isinstance(described, RowResiduals) and (
-        abs(described.median_px) + described.spread_px > _MAX_ROW_OFFSET_PX
-    )
-    # features may not be of the same point
-    if misaligned or any(f.fault in _UNUSABLE for f in findings):
-        why = f"{findings[0].fault if findings else 'image rows do not match'}: correct that first, then measure again"
+    fault = _fault_of_rows(described, findings)
+    if fault is not None:
+        why = f"{fault}: correct that first, then measure again"
         return CalibrationReport(source, stereo, described, _no_imu(why), findings, notes)
     recording = source.dataset.recording
     tracks, samples = tracked or track(source.dataset, build_frontend, frames, progress)

@@ -35,6 +35,20 @@ optimizerMaxIterations: 30
 """
 
 
+def _check_imu(recording: Recording) -> None:
+    if "imu" not in recording.motion or recording.T_cam0_imu is None:
+        raise DataError(
+            f"{recording.path}: the SDK of Spectacular AI needs an IMU, with its pose in the left "
+            "camera; choose another form"
+        )
+
+
+def _add_images(videos: list[_Video], frame: StereoFrame) -> None:
+    for video, image in zip(videos, (frame.left, frame.right), strict=True):
+        assert image is not None
+        video.add(image)
+
+
 def write_spectacularai(
     dataset: Dataset, out: Path, start: int, stop: int | None, progress: Progress
 ) -> tuple[int, int, int]:
@@ -55,11 +69,7 @@ def write_spectacularai(
         DataError: the recording has no IMU, or OpenCV cannot write the videos.
     """
     recording = dataset.recording
-    if "imu" not in recording.motion or recording.T_cam0_imu is None:
-        raise DataError(
-            f"{recording.path}: the SDK of Spectacular AI needs an IMU, with its pose in the left "
-            "camera; choose another form"
-        )
+    _check_imu(recording)
     times = recording.frame_times_ns[start:stop]
     rate_hz = NS_PER_S / float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     videos = [_Video(out / name, rate_hz) for name in VIDEOS]
@@ -76,9 +86,7 @@ def write_spectacularai(
                 samples += 1
                 lines += _imu_lines(event, time_s)
             elif isinstance(event, StereoFrame):
-                for video, image in zip(videos, (event.left, event.right), strict=True):
-                    assert image is not None
-                    video.add(image)
+                _add_images(videos, event)
                 lines.append(_frame_line(frames, time_s))
                 frames += 1
                 progress(frames, len(times))

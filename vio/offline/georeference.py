@@ -19,7 +19,7 @@ from vio.errors import DataError
 from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log
 from vio.geometry.upright import mean_up, up_in
-from vio.mapping.map_store import EarthRow, KeyframeRow, MapStore
+from vio.mapping.map_store import EarthRow, KeyframeRow, LoopRow, MapStore
 from vio.records import BoolArray, Trajectory
 from vio.runs.finished import point_positions, up_of_odometry
 from vio.runs.mapped import read_keyframes, read_loops, read_trajectories
@@ -59,14 +59,6 @@ def _of_run(folder: FilePath) -> Placed:
         raise DataError(
             f"{folder}: its trajectory has no times, which GNSS positions are compared by"
         )
-    place = (
-        {}
-        if trajectory.frame_indices is None
-        else {int(f): k for k, f in enumerate(trajectory.frame_indices)}
-    )
-    kept = [o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None]
-    loops = [(place.get(o.keyframe_frame), place.get(o.frame)) for o in kept]  # type: ignore[arg-type]
-    known = [(i, j) for i, j in loops if i is not None and j is not None and i < j - 1]
     # The landmarks and the vertical are those of the odometry's world.
     up = up_of_odometry(folder, metrics)
     if up is not None:
@@ -74,7 +66,7 @@ def _of_run(folder: FilePath) -> Placed:
     camera = trajectory.in_cam0(T_cam0_imu).T_world_body
     path = _path(
         trajectory,
-        known,
+        _loops_of_run(folder, trajectory),
         -camera[0, :3, 1] if up is None else up,
         _MOUNT_RAD if up is None else _UP_RAD,
     )
@@ -83,6 +75,34 @@ def _of_run(folder: FilePath) -> Placed:
     T = (trajectory.T_world_body @ se3_inverse(odometry.T_world_body))[nearest]
     p = np.einsum("nij,nj->ni", T[:, :3, :3], p) + T[:, :3, 3]
     return Placed(folder.resolve().name, path, trajectory, p)
+
+
+def _loops_of_run(folder: FilePath, trajectory: Trajectory) -> list[tuple[int, int]]:
+    """Return the loops that a run kept, between poses of its trajectory that do not follow each
+    other.
+    """
+    if trajectory.frame_indices is None:
+        return []
+    place = {int(f): k for k, f in enumerate(trajectory.frame_indices)}
+    joined = [
+        (o.keyframe_frame, o.frame)
+        for o in read_loops(folder)
+        if o.kept and o.keyframe_frame is not None
+    ]
+    known = [(place[a], place[b]) for a, b in joined if {a, b} <= place.keys()]
+    return [(i, j) for i, j in known if i < j - 1]
+
+
+def _loops_between(kept: list[int], loops: Sequence[LoopRow]) -> list[tuple[int, int]]:
+    """Return the valid loops between some keyframes of a map, by their places among these."""
+    place = {k: n for n, k in enumerate(kept)}
+    joined = [(o.first, o.second) for o in loops if o.kept]
+    return [(place[i], place[j]) for i, j in joined if i in place and j in place]
+
+
+def _trajectory_of(rows: Sequence[KeyframeRow]) -> Trajectory:
+    times_ns = np.array([row.time_ns for row in rows], dtype=np.int64)
+    return Trajectory(np.array([row.T_map_cam for row in rows]), times_ns, "cam0")
 
 
 def _of_map(file: FilePath) -> Placed:
@@ -94,18 +114,14 @@ def _of_map(file: FilePath) -> Placed:
     kept = [k for k, row in enumerate(rows) if sessions[row.session].part == home]
     if len(kept) < 2:
         raise DataError(f"{file}: has fewer than two keyframes; there is nothing to place")
-    place = {k: n for n, k in enumerate(kept)}
-    known = [
-        (place[o.first], place[o.second])
-        for o in loops
-        if o.kept and o.first in place and o.second in place
-    ]
-    T = np.array([rows[k].T_map_cam for k in kept])
-    trajectory = Trajectory(T, np.array([rows[k].time_ns for k in kept], dtype=np.int64), "cam0")
+    own = [rows[k] for k in kept]
+    known = _loops_between(kept, loops)
+    trajectory = _trajectory_of(own)
+    T = trajectory.T_world_body
     upright = sessions[0].upright
-    up = _up_of_map(T, [rows[k] for k in kept]) if upright else -T[0, :3, 1]
+    up = _up_of_map(T, own) if upright else -T[0, :3, 1]
     path = _path(trajectory, known, up, _UP_RAD if upright else _MOUNT_RAD)
-    breaks = np.flatnonzero(np.diff([rows[k].session for k in kept])) + 1
+    breaks = np.flatnonzero(np.diff([row.session for row in own])) + 1
     return Placed(file.stem, replace(path, breaks=breaks), trajectory, np.zeros((0, 3)))
 
 

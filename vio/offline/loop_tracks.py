@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -37,6 +38,21 @@ def loop_pairs(loops: Sequence[LoopEvent], frames: IntArray) -> IntArray:
     return np.asarray(place[(frames[place] == ends).all(axis=1)], dtype=np.int64)
 
 
+def _ends_of(
+    loops: Sequence[LoopEvent], frames: IntArray
+) -> list[tuple[int, FloatArray, BoolArray]]:
+    """Return row of the keyframe, pixels and which of them have a right one, for both ends of each
+    loop, one after the other.
+    """
+    ends: list[tuple[int, FloatArray, BoolArray]] = []
+    for o in loops:
+        pair = loop_pairs([o], frames)
+        if len(pair) and o.matches is not None:
+            ends.append((int(pair[0, 0]), o.matches.z_keyframe, o.matches.has_right_keyframe))
+            ends.append((int(pair[0, 1]), o.matches.z_frame, o.matches.has_right_frame))
+    return ends
+
+
 def loop_rows(loops: Sequence[LoopEvent], frames: IntArray) -> LoopRows:
     """Return the points that loops join and what keyframes show of them.
 
@@ -47,12 +63,7 @@ def loop_rows(loops: Sequence[LoopEvent], frames: IntArray) -> LoopRows:
         loops: with their matches; those of other runs' keyframes, or without matches, add nothing.
         frames: (K,) frame numbers of the keyframes, increasing.
     """
-    ends: list[tuple[int, FloatArray, BoolArray]] = []  # both ends of a loop, one after the other
-    for o in loops:
-        pair = loop_pairs([o], frames)
-        if len(pair) and o.matches is not None:
-            ends.append((int(pair[0, 0]), o.matches.z_keyframe, o.matches.has_right_keyframe))
-            ends.append((int(pair[0, 1]), o.matches.z_frame, o.matches.has_right_frame))
+    ends = _ends_of(loops, frames)
     if not ends:
         return LoopRows(
             np.zeros(0, dtype=np.int64),
@@ -67,11 +78,10 @@ def loop_rows(loops: Sequence[LoopEvent], frames: IntArray) -> LoopRows:
     key = np.concatenate([keyframe[:, None], z[:, :2]], axis=1)
     _, first, feature = np.unique(key, axis=0, return_index=True, return_inverse=True)
     at = np.cumsum([0, *(len(z) for _, z, _ in ends)])
-    rows = [
-        (np.arange(at[n], at[n + 1]), np.arange(at[n + 1], at[n + 2]))
-        for n in range(0, len(ends), 2)
-    ]
-    a, b = (feature.ravel()[np.concatenate([pair[side] for pair in rows])] for side in (0, 1))
+    rows = [np.arange(begin, end) for begin, end in pairwise(at.tolist())]
+    feature = feature.ravel()
+    a = feature[np.concatenate(rows[::2])]
+    b = feature[np.concatenate(rows[1::2])]
     graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(len(first), len(first)))
     point = connected_components(graph, directed=False)[1].astype(np.int64)
     keyframe = keyframe[first]

@@ -16,10 +16,15 @@ from vio.evaluation.trajectories import metres_text
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.upright import yaw_and_position
 from vio.mapping.map_store import MapStore
-from vio.offline.inertial_refinement import InertialRun, adjust_with_imu, inertial_keyframes
+from vio.offline.inertial_refinement import (
+    InertialRefinement,
+    InertialRun,
+    adjust_with_imu,
+    inertial_keyframes,
+)
 from vio.offline.keyframes import TrackedPath
 from vio.offline.saved_run import closing_loops, without_field
-from vio.records import MapKeyframes, feature_tracks
+from vio.records import IntArray, MapKeyframes, feature_tracks
 from vio.runs.mapped import MappedRun, corrected
 from vio.runs.pipeline import RunResult
 
@@ -65,6 +70,27 @@ def adjust_map(
     return replace(result, mapped=adjusted)
 
 
+def _solve(
+    run: InertialRun,
+    keyframes: IntArray,
+    covariance_of: IntArray,
+    should_stop: Callable[[], str | None],
+) -> InertialRefinement:
+    """Return the adjusted keyframes; raise VioError with the reason why there are none."""
+
+    def go_on() -> None:
+        if (reason := should_stop()) is not None:
+            raise VioError(reason)
+
+    try:
+        done = adjust_with_imu(run, keyframes, covariance_of=covariance_of, progress=go_on)
+    except (RuntimeError, np.linalg.LinAlgError) as error:  # of a matrix without an inverse
+        raise VioError(f"it has no optimum ({error})") from error
+    if not done.best.converged:
+        raise VioError("it did not converge")
+    return done
+
+
 def _adjusted(
     result: RunResult, mapped: MappedRun, should_stop: Callable[[], str | None]
 ) -> MappedRun:
@@ -105,16 +131,7 @@ def _adjusted(
         result.config.imu,
     )
 
-    def go_on() -> None:
-        if (reason := should_stop()) is not None:
-            raise VioError(reason)
-
-    try:
-        done = adjust_with_imu(run, keyframes, covariance_of=near, progress=go_on)
-    except (RuntimeError, np.linalg.LinAlgError) as error:  # of a matrix without an inverse
-        raise VioError(f"it has no optimum ({error})") from error
-    if not done.best.converged:
-        raise VioError("it did not converge")
+    done = _solve(run, keyframes, near, should_stop)
     T = path.trajectory.T_world_body
     number = np.arange(len(path.frames))
     T_map_body = corrected(T, number, keyframes, done.T_world_cam0, T[keyframes]) @ T_cam0_body

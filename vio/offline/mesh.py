@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,7 @@ from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera
 from vio.geometry.upright import up_in, upright_axes
-from vio.mapping.map_graph import MapGraph
-from vio.mapping.map_store import MapStore
+from vio.mapping.map_store import KeyframeRow, MapStore
 from vio.offline.keyframes import after_motion
 from vio.offline.run_images import RunImages, run_images
 from vio.records import Image, IntArray, StereoFrame, Trajectory
@@ -76,6 +75,18 @@ class DenseMap:
     blocks: int
 
 
+def _depth_and_voxel_m(
+    folder: Path, camera: StereoCamera, T_world_cam0: FloatArray, voxel_m: float | None
+) -> tuple[float, float]:
+    """Return the depth of the landmarks that the poses (N, 4, 4) see, or that fits the distance of
+    the samples, and this distance, or that which fits the depth.
+    """
+    if voxel_m is not None:
+        return _landmark_depth_m(folder, T_world_cam0, voxel_m / _RULES.voxel_share), voxel_m
+    depth_m = _landmark_depth_m(folder, T_world_cam0, None)
+    return depth_m, _voxel_m(camera, depth_m)
+
+
 def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> MeshSource:
     """Return what the mesh of a run is made from.
 
@@ -107,14 +118,10 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
         if map_file is None
         else _poses_in_map(map_file, by_odometry)
     )
-    depth_m = _landmark_depth_m(
-        folder, T_odom, None if voxel_m is None else voxel_m / _RULES.voxel_share
-    )
-    voxel_m = _voxel_m(images.camera, depth_m) if voxel_m is None else voxel_m
+    depth_m, voxel_m = _depth_and_voxel_m(folder, images.camera, T_odom, voxel_m)
     chosen = np.array(after_motion(T, _RULES.step_share * depth_m, _RULES.step_deg), dtype=np.int64)
-    up = up_of_odometry(folder, metrics)
-    if up is not None:
-        up = up_in(T, T_odom, up)
+    up_odom = up_of_odometry(folder, metrics)
+    up = None if up_odom is None else up_in(T, T_odom, up_odom)
     poses = "map" if mapped or map_file is not None else "odometry"
     return MeshSource(images, T[chosen], trajectory.frame_indices[chosen], poses, up, voxel_m)
 
@@ -191,23 +198,28 @@ def _gray(image: Image) -> Image:
     )
 
 
+def _session_of(rows: Sequence[KeyframeRow], times_ns: Set[int]) -> list[KeyframeRow]:
+    """Return the keyframes of a map's session that are all of these times; none: there is none."""
+    for session in sorted({row.session for row in rows}):
+        own = [row for row in rows if row.session == session]
+        if all(row.time_ns in times_ns for row in own):
+            return own
+    return []
+
+
 def _poses_in_map(file: Path, run: Trajectory) -> FloatArray:
     """Return the poses (N, 4, 4) of a run's frames in a map that holds it."""
     with contextlib.closing(MapStore(file, read_only=True)) as store:
-        graph = MapGraph(store)
         rows = store.keyframes()
     assert run.times_ns is not None
     assert run.frame_indices is not None
     place = {int(t): k for k, t in enumerate(run.times_ns.tolist())}
-    for session in range(len(graph.sessions)):
-        own = [k for k in rows if k.session == session]
-        if own and all(k.time_ns in place for k in own):
-            at = np.array([place[k.time_ns] for k in own])
-            frames = run.frame_indices[at]
-            T_map = np.array([k.T_map_cam for k in own])
-            return corrected(
-                run.T_world_body, run.frame_indices, frames, T_map, run.T_world_body[at]
-            )
+    own = _session_of(rows, place.keys())
+    if own:
+        at = [place[k.time_ns] for k in own]
+        frames = run.frame_indices[at]
+        T_map = np.array([k.T_map_cam for k in own])
+        return corrected(run.T_world_body, run.frame_indices, frames, T_map, run.T_world_body[at])
     raise DataError(
         f"{file}: holds no session of this run; give the map that vio run --map FILE wrote in it"
     )

@@ -55,6 +55,38 @@ class Refinement:
     ate_m: float | None  # likewise, after refinement
 
 
+def _check_choice(run: SavedRun, *, priors: bool, imu: bool) -> None:
+    """Raise ConfigError where a run cannot be refined with what was asked for."""
+    path = run.tracked
+    if priors and path.loops:
+        raise ConfigError(
+            f"{path.where}: its loops moved the poses away from the filter's; leave --priors out"
+        )
+    has_imu = run.metrics.get("motion") == "imu" and (path.where / RunFile.ESTIMATES).is_file()
+    if imu and (priors or not has_imu or run.dataset.recording.camera.is_cylinder):
+        raise ConfigError(
+            f"{path.where}: --imu takes a run with an IMU and a pinhole pair, and no --priors "
+            "filter"
+        )
+
+
+def _warn_of_distance(path: TrackedPath, moved_rms_m: float) -> None:
+    """Say so where the refined poses are far from the run's, beside its standard deviations."""
+    if path.sigmas is None:
+        return
+    sigma_m = float(np.sqrt(np.mean(path.sigmas[:, 0] ** 2)))
+    if moved_rms_m > _MAX_SIGMAS * sigma_m:
+        log.warning(
+            "the refined poses are %.2g m (rms) from the run's, %.1f times its standard "
+            "deviation of %.2g m: "
+            "images that show little do not hold poses alone, as an IMU does; compare both "
+            "before you use them",
+            moved_rms_m,
+            moved_rms_m / sigma_m,
+            sigma_m,
+        )
+
+
 def refine_run(
     run: SavedRun,
     *,
@@ -87,16 +119,7 @@ def refine_run(
         VioError: the run has too few views or no consistent track, or the solver failed.
     """
     path = run.tracked
-    if priors and path.loops:
-        raise ConfigError(
-            f"{path.where}: its loops moved the poses away from the filter's; leave --priors out"
-        )
-    has_imu = run.metrics.get("motion") == "imu" and (path.where / RunFile.ESTIMATES).is_file()
-    if imu and (priors or not has_imu or run.dataset.recording.camera.is_cylinder):
-        raise ConfigError(
-            f"{path.where}: --imu takes a run with an IMU and a pinhole pair, and no --priors "
-            "filter"
-        )
+    _check_choice(run, priors=priors, imu=imu)
     rounds = iter((2, 3))
     held = None
     if imu:
@@ -127,18 +150,7 @@ def refine_run(
     refined = replace(path.trajectory, T_world_body=poses)
     before, after = _scores(run, refined)
     moved_rms_m = aligned_distance_m(path.trajectory.T_world_body, refined.T_world_body)
-    if path.sigmas is not None:
-        sigma_m = float(np.sqrt(np.mean(path.sigmas[:, 0] ** 2)))
-        if moved_rms_m > _MAX_SIGMAS * sigma_m:
-            log.warning(
-                "the refined poses are %.2g m (rms) from the run's, %.1f times its standard "
-                "deviation of %.2g m: "
-                "images that show little do not hold poses alone, as an IMU does; compare both "
-                "before you use them",
-                moved_rms_m,
-                moved_rms_m / sigma_m,
-                sigma_m,
-            )
+    _warn_of_distance(path, moved_rms_m)
     return Refinement(
         trajectory=refined,
         landmarks=landmarks_of(path.camera, done.T_world_cam0, done.tracks, done.sigma_px),

@@ -111,19 +111,18 @@ class RunImages:
         return Rectifier(rig_from_rectified(camera, np.eye(4)), camera, np.eye(4), maps, "linear")
 
 
+def _spans(dataset: Dataset, indices: list[int]) -> list[tuple[int, int]]:
+    """Return which frames, each from one on to before another, are read to get some of them."""
+    if isinstance(dataset, ImageDataset):
+        return [(k, k + 1) for k in indices]
+    return [(indices[0], indices[-1] + 1)] if indices else []
+
+
 def _chosen(dataset: Dataset, indices: list[int]) -> Iterator[StereoFrame]:
     """Yield some frames: image files one by one, others, which are read in order, in one pass."""
-    files = isinstance(dataset, ImageDataset)
-    spans = (
-        [(k, k + 1) for k in indices]
-        if files
-        else [(indices[0], indices[-1] + 1)]
-        if indices
-        else []
-    )
     waiting = iter(indices)
     due = next(waiting, None)
-    for start, stop in spans:
+    for start, stop in _spans(dataset, indices):
         for event in dataset.events(start, stop):
             if isinstance(event, StereoFrame) and event.index == due and event.left is not None:
                 yield event

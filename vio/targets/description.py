@@ -280,22 +280,31 @@ def read_target(path: Path, size_m: float | None = None) -> Target:
     return target
 
 
+def _kind_by_entries(entries: Mapping[str, Any]) -> str:
+    """Return the kind of Kalibr's boards that a file without `target_type` describes; "": none."""
+    if "tagCols" in entries:
+        return "aprilgrid"
+    return "checkerboard" if "targetCols" in entries else ""
+
+
 def _from_entries(entries: Mapping[str, Any], path: Path, size_m: float | None) -> Target:
-    kind = str(entries.get("target_type", "")).lower()
+    stated = str(entries.get("target_type", "")).lower()
+    kind = stated or _kind_by_entries(entries)
     reader = _Entries(entries, path, size_m)
-    if kind == "aprilgrid" or (not kind and "tagCols" in entries):
-        return reader.aprilgrid()
-    if kind == "checkerboard" or (not kind and "targetCols" in entries):
-        return reader.kalibr_checkerboard()
-    if kind == "charuco":
-        return reader.charuco()
+    readers = {
+        "aprilgrid": reader.aprilgrid,
+        "checkerboard": reader.kalibr_checkerboard,
+        "charuco": reader.charuco,
+    }
+    if kind in readers:
+        return readers[kind]()
     settings = entries.get("Settings", entries)
     if isinstance(settings, dict) and "BoardSize_Width" in settings:
         return _Entries(settings, path, size_m).opencv()
     for key, value in entries.items():
         if str(key).endswith("ConfigCalibrationTarget") and isinstance(value, dict):
             return _Entries(value.get("grid", {}), path, size_m).boofcv()
-    named = f"target_type {kind!r}" if kind else "its content"
+    named = f"target_type {stated!r}" if stated else "its content"
     raise CalibrationError(f"{path}: {named} is no board that is read; give {KNOWN}")
 
 

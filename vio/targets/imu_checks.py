@@ -54,18 +54,15 @@ def check_imu(
             raise _error(finding)
     size = judge_size(imu.times_ns, imu.accel)
     intervals = _intervals(times_ns, T_cam0_board)
-    record = None
     gyro_fit = None
+    found = [] if size.finding is None else [size.finding]
+    # With fewer, the adjustment says which rotation is missing.
     if len(intervals) >= _MIN_INTERVALS:
         values = np.concatenate([imu.gyro, imu.accel], axis=1)
         record = record_of(intervals, imu.times_ns, values)
         step_s = median(record.end - record.begin)
         gyro_fit = fit_gyro(record, _MIN_INTERVALS, np.sqrt(2) * rotation_sigma_rad / step_s)
-    if record is None or gyro_fit is None:
-        # The adjustment says which rotation is missing.
-        found = [] if size.finding is None else [size.finding]
-    else:
-        found = _judge(record, gyro_fit, size)
+        found = found if gyro_fit is None else _judge(record, gyro_fit, size)
     for finding in found:
         if finding.certain:
             raise _error(finding)
@@ -87,15 +84,16 @@ def _intervals(times_ns: IntArray, T_cam0_board: FloatArray) -> Intervals:
     return Intervals(times_ns[rows], times_ns[rows + 1], twists)
 
 
-def _judge(record: Record, gyro_fit: GyroFit, size: Size) -> list[InertialFinding]:
-    """Compare the IMU with the board's poses, as `vio.monitor.inertial` compares it with tracks."""
-    R = nearest_rotation(gyro_fit.S_cg)
-    if gyro_fit.axes == 3 and not gyro_fit.fits(R) and gyro_fit.fits(_nearest_map(gyro_fit.S_cg)):
-        return [_MIRRORED]
-    if gyro_fit.unexplained > AGREES:
-        return [_disagreement(gyro_fit)]
+def _is_mirrored(gyro_fit: GyroFit, R: FloatArray) -> bool:
+    """Whether the nearest orthogonal map fits and the nearest rotation (3, 3) does not."""
+    fits_mirrored = gyro_fit.fits(_nearest_map(gyro_fit.S_cg))
+    return gyro_fit.axes == 3 and fits_mirrored and not gyro_fit.fits(R)
+
+
+def _evidence(record: Record, gyro_fit: GyroFit, size: Size, R: FloatArray) -> Evidence:
+    """Return what both sensors show beside the board's poses, with a rotation (3, 3)."""
     force = None if size.unit is None else fit_force(record, gyro_fit, np.zeros(3))
-    evidence = Evidence(
+    return Evidence(
         R_cam0_imu=R,
         gyro_fit=gyro_fit,
         force=force,
@@ -104,6 +102,16 @@ def _judge(record: Record, gyro_fit: GyroFit, size: Size) -> list[InertialFindin
         clipped=False,
         last=True,
     )
+
+
+def _judge(record: Record, gyro_fit: GyroFit, size: Size) -> list[InertialFinding]:
+    """Compare the IMU with the board's poses, as `vio.monitor.inertial` compares it with tracks."""
+    R = nearest_rotation(gyro_fit.S_cg)
+    if _is_mirrored(gyro_fit, R):
+        return [_MIRRORED]
+    if gyro_fit.unexplained > AGREES:
+        return [_disagreement(gyro_fit)]
+    evidence = _evidence(record, gyro_fit, size, R)
     size = resolve_size(size, evidence)
     found = judge_gyro(evidence, size.unit or 1.0)
     if size.finding is not None:

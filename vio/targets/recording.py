@@ -30,7 +30,7 @@ from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel
 from vio.protocols import Dataset, Progress
 from vio.records import Image, ImuRecord, ImuSample
-from vio.targets.corners import CornerDetector
+from vio.targets.corners import CornerDetector, Corners
 from vio.targets.views import View
 
 MAX_FRAMES = 80  # in which the board is looked for, spread over the recording
@@ -135,6 +135,11 @@ def _size_and_cameras(
     videos = video_files(path) if path.is_dir() else None
     if videos is not None:
         return _size_of_video(videos[0]), 2
+    return _size_and_cameras_as_read(source, path)
+
+
+def _size_and_cameras_as_read(source: str, path: Path) -> tuple[tuple[int, int], int]:
+    """Return what the reader of a recording knows of size and cameras."""
     try:
         dataset = open_dataset(source)
     except CalibrationError as error:
@@ -226,6 +231,21 @@ def _imu_of(dataset: ImageRecording) -> ImuRecord | None:
     )
 
 
+def _detect(
+    loaded: Iterator[tuple[int, Images]], detector: CornerDetector
+) -> Iterator[tuple[int, Images, tuple[Corners, ...]]]:
+    """Yield time and images of each frame, and the corners that each image shows, which are found
+    on all processor cores.
+    """
+    workers = os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        while batch := list(islice(loaded, 2 * workers)):
+            flat = [image for _, images in batch for image in images]
+            found = iter(list(pool.map(detector.detect, flat)))
+            for time_ns, images in batch:
+                yield time_ns, images, tuple(next(found) for _ in images)
+
+
 def film(
     raw: RawRecording,
     detector: CornerDetector,
@@ -253,21 +273,14 @@ def film(
     sizes: tuple[tuple[int, int], ...] = ()
     frames = 0
     between = max(len(chosen) // _SAMPLES, 1)
-    workers = os.cpu_count() or 1
-    loaded = raw.load(chosen)
-    with ThreadPoolExecutor(workers) as pool:
-        while batch := list(islice(loaded, 2 * workers)):
-            flat = [image for _, images in batch for image in images]
-            found = iter(list(pool.map(detector.detect, flat)))
-            for time_ns, images in batch:
-                if frames % between == 0:
-                    samples.append(images)
-                frames += 1
-                sizes = tuple((image.shape[1], image.shape[0]) for image in images)
-                corners = tuple(next(found) for _ in images)
-                if any(len(one) for one in corners):
-                    views.append(View(time_ns, corners))
-                progress(frames, len(chosen))
+    for time_ns, images, corners in _detect(raw.load(chosen), detector):
+        if frames % between == 0:
+            samples.append(images)
+        frames += 1
+        sizes = tuple((image.shape[1], image.shape[0]) for image in images)
+        if any(len(one) for one in corners):
+            views.append(View(time_ns, corners))
+        progress(frames, len(chosen))
     if not frames:
         raise DataError(f"{raw.path}: no image could be read; copy it again")
     return Filmed(views, sizes, frames, imu, raw.notes, tuple(samples))

@@ -60,19 +60,21 @@ class Sightings:
 def sightings(views: Sequence[View], points_m: FloatArray) -> Sightings:
     """Return the corners of views as rows."""
     cameras = len(views[0].corners) if views else 1
-    parts = [
-        (v, c, corners)
+    cells = [
+        (v, c)
         for v, one in enumerate(views)
         for c, corners in enumerate(one.corners)
         if len(corners)
     ]
-    counts = [len(corners) for _, _, corners in parts]
+    view, camera = np.array(cells, dtype=np.int64).reshape(-1, 2).T
+    shown = [views[v].corners[c] for v, c in cells]
+    counts = list(map(len, shown))
     return Sightings(
         points_m,
         len(views),
         cameras,
-        np.repeat(np.array([v for v, _, _ in parts], dtype=np.int64), counts),
-        np.repeat(np.array([c for _, c, _ in parts], dtype=np.int64), counts),
-        np.concatenate([c.ids for _, _, c in parts] or [np.zeros(0, dtype=np.int64)]),
-        np.concatenate([c.uv for _, _, c in parts] or [np.zeros((0, 2))]),
+        np.repeat(view, counts),
+        np.repeat(camera, counts),
+        np.concatenate([corners.ids for corners in shown] or [np.zeros(0, dtype=np.int64)]),
+        np.concatenate([corners.uv for corners in shown] or [np.zeros((0, 2))]),
     )

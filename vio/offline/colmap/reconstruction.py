@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -126,9 +127,26 @@ def pairs_to_match(names: ModelImages, loops: IntArray) -> list[tuple[str, str]]
     out += [
         (names.right[k], names.left[k + step]) for step in _CROSS_NEXT for k in range(count - step)
     ]
-    around = {(a + i, b + j) for a, b in loops.tolist() for i in _AROUND_LOOP for j in _AROUND_LOOP}
-    out += [(names.left[a], names.left[b]) for a, b in sorted(around) if 0 <= a < b < count]
+    out += [(names.left[a], names.left[b]) for a, b in _around(loops) if 0 <= a < b < count]
     return list(dict.fromkeys(out))
+
+
+def _around(loops: IntArray) -> list[tuple[int, int]]:
+    """Return the pairs of keyframes that loops (L, 2) join, and those of their neighbours."""
+    steps = list(product(_AROUND_LOOP, repeat=2))
+    return sorted({(a + i, b + j) for a, b in loops.tolist() for i, j in steps})
+
+
+def _poses(model: pycolmap.Reconstruction, names: ModelImages) -> list[tuple[int, FloatArray]]:
+    """Return the keyframes whose left images a model has a pose of, and these poses (4, 4) of the
+    world in the camera, in order.
+    """
+    place = {name: k for k, name in enumerate(names.left)}
+    return sorted(
+        (place[image.name], pose_rows(image.cam_from_world()))
+        for image in model.images.values()
+        if image.has_pose and image.name in place
+    )
 
 
 def reconstruct(
@@ -164,12 +182,7 @@ def reconstruct(
     if not models:
         return None
     model = max(models.values(), key=lambda m: int(m.num_reg_images()))
-    place = {name: k for k, name in enumerate(names.left)}
-    found = sorted(
-        (place[image.name], pose_rows(image.cam_from_world()))
-        for image in model.images.values()
-        if image.has_pose and image.name in place
-    )
+    found = _poses(model, names)
     if len(found) < _MIN_REGISTERED:
         return None
     keyframes = np.array([k for k, _ in found], dtype=np.int64)

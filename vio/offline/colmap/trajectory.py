@@ -17,6 +17,16 @@ _MODEL_FILES = ("images.bin", "images.txt")
 _STAMP = re.compile(r"\d{15,19}")  # nanoseconds, as in EuRoC's file names
 
 
+def _read(place: Path) -> pycolmap.Reconstruction:
+    try:
+        return pycolmap.Reconstruction(place)
+    except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as error:
+        raise DataError(
+            f"{place}: pycolmap cannot read the model ({' '.join(str(error).split())[:160]}); "
+            "export it again"
+        ) from error
+
+
 def read_colmap_trajectory(folder: Path) -> Trajectory:
     """Read the poses of a COLMAP model as a trajectory of cam0: the rig's reference camera, or the
     only camera.
@@ -32,16 +42,8 @@ def read_colmap_trajectory(folder: Path) -> Trajectory:
         raise DataError(
             f"{folder}: no COLMAP model (no images.bin or images.txt, also not in sparse/0)"
         )
-    try:
-        model = pycolmap.Reconstruction(place)
-    except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as error:
-        raise DataError(
-            f"{place}: pycolmap cannot read the model ({' '.join(str(error).split())[:160]}); "
-            "export it again"
-        ) from error
-    images = [
-        image for image in model.images.values() if image.has_pose and _is_reference(model, image)
-    ]
+    model = _read(place)
+    images = _reference_images(model)
     if not images:
         raise DataError(f"{place}: the model contains no image with a pose")
     stamps = [_number(image.name, place) for image in images]
@@ -67,6 +69,12 @@ def model_folder(folder: Path) -> Path | None:
     return next(
         (place for place in places if any((place / name).is_file() for name in _MODEL_FILES)), None
     )
+
+
+def _reference_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """Return the reference camera's images of known pose."""
+    images = model.images.values()
+    return [image for image in images if image.has_pose and _is_reference(model, image)]
 
 
 def _is_reference(model: pycolmap.Reconstruction, image: pycolmap.Image) -> bool:
