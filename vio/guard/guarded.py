@@ -11,6 +11,7 @@ from vio.guard.frozen_image import FrozenCamera
 from vio.guard.image_check import FrameImages, ImageCheck, images_of
 from vio.guard.match_check import without_right
 from vio.guard.matches import RightMatches
+from vio.guard.never_matched import NeverMatched
 from vio.guard.pairing import PairingCheck
 from vio.guard.probe import RowProbe
 from vio.guard.swap import SwapDetector
@@ -59,6 +60,7 @@ class GuardedFrontend:
         self._pair = camera.kind == "stereo"
         self._checks = image_checks(camera)
         self._matches = RightMatches(camera)
+        self._never = NeverMatched() if self._pair else None
         self._swap = next((c for c in self._checks if isinstance(c, SwapDetector)), None)
         self._exchange = next((c for c in self._checks if isinstance(c, ExchangeDetector)), None)
 
@@ -96,6 +98,9 @@ class GuardedFrontend:
         elif not (isinstance(frontend, ChecksMatches) and frontend.checks_matches):
             seen = self._matches.inspect(seen)
             found = (*found, *self._matches.take_findings())
+        if right_usable and self._never is not None:
+            self._never.see(seen)
+            found = (*found, *self._never.take_findings())
         return _with_findings(output, seen, found)
 
     def _inspect(self, images: FrameImages) -> FrameImages:
