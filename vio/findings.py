@@ -124,6 +124,11 @@ CODES: dict[str, Code] = {
         "hardly any feature has a right match any more; the left pixels are used",
         _CAMERA,
     ),
+    "right-matches-missing": Code(
+        "unusable",
+        "hardly any feature has had a right match yet, so lengths are unknown",
+        "vio inspect says whether right images are turned, exchanged or not of this calibration",
+    ),
     "right-camera-turned": Code(
         "degraded",
         "the right camera has turned in its mount; what that does to disparities is taken out",

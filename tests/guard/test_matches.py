@@ -203,20 +203,6 @@ def test_hardly_any_match_must_be_left(share: float, lost: bool) -> None:
     assert codes(check.take_findings()) == (["right-matches-lost"] if lost else [])
 
 
-@pytest.mark.parametrize(("share", "lost"), [(0.05, True), (0.07, False)])
-def test_hardly_any_match_from_the_first_frame_on_is_reported(share: float, lost: bool) -> None:
-    """Right images that are turned, or of another recording, have never had any."""
-    check = LostMatches()
-    nothing = shared_matches(None, flight()[0])
-    for k in range(20):
-        has_right = np.arange(100) < 100 * (share if k < 15 else 0.5)
-        seen = observations(k, k, np.arange(100), np.zeros((100, 4)), has_right)
-        assert check.inspect(seen, nothing) is seen
-    found = check.take_findings()
-    assert codes(found) == (["right-matches-lost", "-right-matches-lost"] if lost else [])
-    assert "instead of" not in found[0].message if lost else True
-
-
 def test_few_right_matches_may_be_usual() -> None:
     assert codes(inspected(flight(visible=0.2))[1]) == []
 

@@ -151,7 +151,7 @@ def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> In
         remedy = (
             f"{repeated} of {len(times)} times repeat the one before, as times do that are written "
             "with too few digits; write all their digits"
-            if repeated > _ROUNDED * len(times)
+            if repeated > 1 + _ROUNDED * len(times)
             else "remove or reorder that entry"
         )
         raise DataError(f"{where(k)}: the clock {what} ({now} s after {before} s); {remedy}")

@@ -12,6 +12,7 @@ from vio.guard.image_check import FrameImages, ImageCheck, images_of
 from vio.guard.match_check import without_right
 from vio.guard.matches import RightMatches
 from vio.guard.object_matches import ObjectMatches
+from vio.guard.never_matched import NeverMatched
 from vio.guard.pairing import PairingCheck
 from vio.guard.probe import RowProbe
 from vio.guard.swap import SwapDetector
@@ -64,6 +65,7 @@ class GuardedFrontend:
         self._checks = image_checks(camera)
         self._matches = RightMatches(camera)
         self._objects = ObjectMatches(camera)
+        self._never = NeverMatched() if self._pair else None
         self._swap = next((c for c in self._checks if isinstance(c, SwapDetector)), None)
         self._exchange = next((c for c in self._checks if isinstance(c, ExchangeDetector)), None)
 
@@ -107,6 +109,9 @@ class GuardedFrontend:
         if self._may_check_objects is None or not self._may_check_objects.checks_objects:
             seen = self._objects.inspect(seen, prior)
             found = (*found, *self._objects.take_findings())
+        if right_usable and self._never is not None:
+            self._never.see(seen)
+            found = (*found, *self._never.take_findings())
         return _with_findings(output, seen, found)
 
     def _inspect(self, images: FrameImages) -> FrameImages:

@@ -1,6 +1,4 @@
-"""Right matches that fail nearly all at once, or that never were: the right image is dark, covered
-or turned, or does not belong to the left one.
-"""
+"""Right matches that fail nearly all at once: the right image is dark, covered or turned away."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ _CODE = "right-matches-lost"
 
 
 class LostMatches(MatchCheck):
-    """Reports that hardly any feature has a right match, or any more; it changes nothing."""
+    """Reports that hardly any feature has a right match any more; it changes nothing."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -45,17 +43,10 @@ class LostMatches(MatchCheck):
             usual = share if self._usual is None else self._usual
             self._usual = usual + _RULES.gain * (share - usual)
         if share is not None and state.to_report():
-            usual = self._usual or 0.0
-            instead = f" instead of {100 * usual:.0f} %" if usual >= _RULES.min_usual else ""
-            cause = (
-                "the right camera may be dark, covered or turned"
-                if instead
-                else "the right images may be turned, or not those of the left ones, or the "
-                "calibration is not theirs (vio inspect)"
-            )
             message = (
                 f"frame {index}: hardly any feature has a right match since frame {state.since} "
-                f"({100 * share:.0f} %{instead}); {cause}; going on with the left pixels"
+                f"({100 * share:.0f} % instead of {100 * (self._usual or 0.0):.0f} %); the right "
+                "camera may be dark, covered or turned; going on with the left pixels"
             )
             figures = {"share": share, "usual_share": self._usual or 0.0}
             self._found.append(
@@ -67,11 +58,8 @@ class LostMatches(MatchCheck):
         return seen
 
     def _is_lost(self, share: float | None) -> bool | None:
-        if share is None:
+        if share is None or self._usual is None or self._usual < _RULES.min_usual:
             return None
-        usual = max(self._usual or 0.0, _RULES.min_usual)
-        if share < _RULES.lost * usual:
+        if share < _RULES.lost * self._usual:
             return True
-        known = self._usual is not None and self._usual >= _RULES.min_usual
-        back = _RULES.back if known else 1.0
-        return False if share >= back * usual else None
+        return False if share >= _RULES.back * self._usual else None

@@ -1,0 +1,68 @@
+"""Right matches that hardly any feature has had yet: the right images are turned, or belong to
+other left ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vio.findings import Finder, Finding
+from vio.records import Observations
+
+
+@dataclass(frozen=True, slots=True)
+class _NeverRules:
+    """When right matches count as missing."""
+
+    min_features: int = 20  # in a frame that tells
+    # share of features with a right match: one frame with more of them shows a pair. The least
+    # median of healthy recordings is 0.29 (Karlsruhe, a hood in view).
+    most: float = 0.06
+    frames: int = 5  # that tell, before it is reported
+    back: float = 0.3  # share from which on a reported loss has ended
+
+
+_RULES = _NeverRules()
+_CODE = "right-matches-missing"
+
+
+class NeverMatched(Finder):
+    """Reports that no frame has had more than a few right matches; it changes nothing.
+
+    What a pair loses later is for the checks of right matches to say.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._since: int | None = None  # first frame that told
+        self._frames = 0
+        self._reported = False
+        self._over = False
+
+    def see(self, seen: Observations) -> None:
+        """Take the features of a frame whose right image may be used."""
+        if self._over or len(seen) < _RULES.min_features:
+            return
+        index = seen.frame_index
+        share = float(seen.has_right.mean())
+        if self._reported:
+            if share >= _RULES.back:
+                self._over = True
+                message = f"frame {index}: features have right matches"
+                self._found.append(Finding(_CODE, message, index, ended=True))
+            return
+        if share > _RULES.most:
+            self._over = True
+            return
+        self._since = index if self._since is None else self._since
+        self._frames += 1
+        if self._frames < _RULES.frames:
+            return
+        self._reported = True
+        message = (
+            f"frame {index}: hardly any feature has a right match since the first frame "
+            f"({100 * share:.0f} %), so lengths are unknown; the right images may be turned, or not "
+            "belong to the left ones or the calibration (vio inspect)"
+        )
+        figures = {"share": share}
+        self._found.append(Finding(_CODE, message, index, self._since, lasts=True, figures=figures))
