@@ -63,6 +63,8 @@ _RENDERED = {
     "wide": "--rig fisheye --width 320 --rate 10 --duration 1.5",
     "drive": "--scene street --trajectory car --width 320 --duration 0.8",
     "depth": "--rig small --width 320 --rate 10 --duration 0.8 --format rgbd",
+    # whose tracks contradict the predicted motion, as real ones do
+    "shaken": "--rig small --width 320 --trajectory handheld --realism real --duration 0.5",
 }
 _COMMANDS = (
     "run flight --map flight.map --out mapped",
@@ -75,6 +77,7 @@ _COMMANDS = (
     "run drive --out driven",
     "run drive --no-plot --out matched --frontend orb",
     "run depth --no-plot --out depths",
+    "run shaken --no-plot --out contradicted",
 )
 
 

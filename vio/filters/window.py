@@ -9,6 +9,7 @@ is, `vio.filters.prior` holds the covariance.
 from __future__ import annotations
 
 from dataclasses import field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -87,6 +88,13 @@ class Clones:
 _NO_CALIBRATION = Calibration(np.eye(4))
 
 
+@lru_cache(maxsize=64)
+def _error_state(
+    calibration: tuple[tuple[str, int], ...], clones: int, landmarks: int
+) -> ErrorState:
+    return ErrorState(dict(calibration), clones, landmarks)
+
+
 class Window:
     """The states of the sliding-window filter."""
 
@@ -117,7 +125,8 @@ class Window:
 
     def _lay_out(self) -> None:
         """Find the rows of all errors, after a change of which there are."""
-        self.state = ErrorState(self.calibration.estimated, len(self.clones), len(self.landmarks))
+        blocks = tuple(self.calibration.estimated.items())
+        self.state = _error_state(blocks, len(self.clones), len(self.landmarks))
 
     def T_cam0_world(self, first: int = 0) -> FloatArray:
         """Camera poses (N, 4, 4) at the exposures from one on."""

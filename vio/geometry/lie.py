@@ -188,14 +188,25 @@ def _quat_xyzw_of_one(R: FloatArray) -> tuple[float, float, float, float]:
     return x / size, y / size, z / size, w / size
 
 
+def _rotation_vector_of_one(R: FloatArray) -> tuple[float, float, float] | None:
+    """Entries of the rotation vector of a single finite matrix (3, 3); None: it is another
+    array.
+    """
+    if R.ndim != 2:
+        return None
+    x, y, z, w = _quat_xyzw_of_one(R)
+    if not math.isfinite(x + y + z + w):
+        return None
+    s = math.sqrt(x * x + y * y + z * z)
+    ratio = 2.0 if s < 1e-7 else 2 * math.atan2(s, w) / s
+    return ratio * x, ratio * y, ratio * z
+
+
 def so3_log(R: npt.ArrayLike) -> FloatArray:
     """Rotation vectors (..., 3), angle in [0, pi], of rotation matrices (..., 3, 3)."""
     R = np.asarray(R, dtype=np.float64)
-    if R.ndim == 2 and math.isfinite(float(R.sum())):
-        x, y, z, w1 = _quat_xyzw_of_one(R)
-        length = math.sqrt(x * x + y * y + z * z)
-        ratio = 2.0 if length < 1e-7 else 2 * math.atan2(length, w1) / length
-        return np.array([ratio * x, ratio * y, ratio * z])
+    if (one := _rotation_vector_of_one(R)) is not None:
+        return np.array(one)
     q = quat_xyzw_from_rotation(R)
     vector = q[..., :3]
     w = q[..., 3]
@@ -215,19 +226,20 @@ def so3_left_jacobian(phi: npt.ArrayLike) -> FloatArray:
     return np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W)
 
 
+def _inverse_coefficient_of_one(angle: float) -> float:
+    """Coefficient of `W W` in the inverse of the left Jacobian, for one finite angle."""
+    squared = angle * angle
+    if angle < _SMALL_ANGLE_RAD:
+        return 1 / 12 + squared / 720 * (1 + squared / 42)
+    a, b, _ = _sinc_terms_of_one(angle)
+    return (1 - a / (2 * b)) / squared
+
+
 def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
     """Inverse of the left Jacobian of SO(3), (..., 3, 3), for angles below 2 pi."""
     phi = np.asarray(phi, dtype=np.float64)
     if (one := _one(phi)) is not None:
-        x, y, z, angle1 = one
-        a1, b1, _ = _sinc_terms_of_one(angle1)
-        squared = angle1 * angle1
-        c = (
-            1 / 12 + squared / 720 * (1 + squared / 42)
-            if angle1 < _SMALL_ANGLE_RAD
-            else (1 - a1 / (2 * b1)) / squared
-        )
-        return _series(x, y, z, -0.5, c)
+        return _series(*one[:3], -0.5, _inverse_coefficient_of_one(one[3]))
     angle = np.linalg.norm(phi, axis=-1)
     a, b, _ = _sinc_terms(angle)
     small = angle < _SMALL_ANGLE_RAD
@@ -266,6 +278,13 @@ def se3_exp(xi: npt.ArrayLike) -> FloatArray:
 def se3_log(T: npt.ArrayLike) -> FloatArray:
     """Twists (..., 6) `[rho; phi]` of transforms (..., 4, 4); the rotation angle is in [0, pi]."""
     T = np.asarray(T, dtype=np.float64)
+    if (one := _rotation_vector_of_one(T[..., :3, :3])) is not None:
+        x, y, z = one
+        c = _inverse_coefficient_of_one(math.sqrt(x * x + y * y + z * z))
+        xi = np.empty((6, 1))
+        np.matmul(_series(x, y, z, -0.5, c), T[:3, 3, None], out=xi[:3])
+        xi[3:, 0] = one
+        return xi[:, 0]
     phi = so3_log(T[..., :3, :3])
     rho = (so3_left_jacobian_inverse(phi) @ T[..., :3, 3, None])[..., 0]
     return np.concatenate([rho, phi], axis=-1)

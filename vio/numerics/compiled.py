@@ -47,33 +47,31 @@ class Loop:
         self.function = function
         self.options = options
         _FUNCTIONS.add(function)
-        self._call: Callable[..., Any] = self._first_call
+        self.is_called = False  # from Python
+        # of the extension module, each for arguments of other types; that of the last call first
+        self._codes: list[Callable[..., Any]] = []
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it."""
-        try:
-            return self._call(*arguments)
-        except (
-            TypeError
-        ):  # nothing is computed yet: the arguments are of types that the extension has no code for
+        codes = self._codes
+        for code in codes:
+            try:
+                found = code(*arguments)
+            except TypeError:  # nothing is computed yet: the arguments are of other types
+                continue
+            if code is not codes[0]:
+                self._codes = [code, *(other for other in codes if other is not code)]
+            return found
+        if self.is_called:
             return self.by_numba(*arguments)
+        return self._first_call(*arguments)
 
     def _first_call(self, *arguments: Any) -> Any:
-        codes = prebuilt.code_of(self.function, lambda: self.fingerprint)
-        if not codes:
-            if compiling.before_first_call is not None:
-                compiling.before_first_call(self.function.__module__)
-            self._call = self.by_numba
-        elif len(codes) == 1:
-            self._call = codes[0]
-        else:
-            self._call = functools.partial(_first_that_takes, codes)
-        return self._call(*arguments)
-
-    @property
-    def is_called(self) -> bool:
-        """Whether it has been called from Python."""
-        return self._call != self._first_call
+        self._codes = prebuilt.code_of(self.function, lambda: self.fingerprint)
+        if not self._codes and compiling.before_first_call is not None:
+            compiling.before_first_call(self.function.__module__)
+        self.is_called = True
+        return self(*arguments)
 
     @functools.cached_property
     def fingerprint(self) -> str:
@@ -107,21 +105,6 @@ class Loop:
         """Whether this process has compiled it, rather than loaded it."""
         stats = getattr(self.__dict__.get("by_numba"), "stats", None)  # none with NUMBA_DISABLE_JIT
         return stats is not None and bool(stats.cache_misses)
-
-
-def _first_that_takes(codes: list[Callable[..., Any]], *arguments: Any) -> Any:
-    """Call the first function that takes arguments of these types; the next call begins with it."""
-    for k, code in enumerate(codes[:-1]):
-        try:
-            found = code(*arguments)
-        except TypeError:
-            continue
-        if k:
-            codes.insert(0, codes.pop(k))
-        return found
-    found = codes[-1](*arguments)
-    codes.insert(0, codes.pop())
-    return found
 
 
 def compiled(function: Function) -> Function:
