@@ -38,6 +38,9 @@ _PRINCIPAL_POINT = 1 / 3
 _COLUMNS_BY_ROWS = 3.0
 # how much larger the rows' field must become for what was learned of the columns to be in doubt
 _ROWS_MOVED = 2.0
+# root mean square of a rows' field that says no more of the columns than their least prior does, in
+# focal lengths
+_LEAST_ROWS = MIN_FIELD_SIGMA / _COLUMNS_BY_ROWS
 
 
 def rows_off(camera: StereoCamera, offset_px: float) -> float:
@@ -85,7 +88,7 @@ class RigCalibration:
         # (8,) before anything was seen of it
         self._field_variances = prior_variances(settings)["stereo_field"]
         # size of the rows' field that gave them, focal lengths
-        self._rows_off = MIN_FIELD_SIGMA / _COLUMNS_BY_ROWS
+        self._rows_off = _LEAST_ROWS
         # at a calibration, by the present rows
         self._field: tuple[Calibration, StereoCorrection | None] | None = None
 
@@ -109,14 +112,22 @@ class RigCalibration:
         """Learn the rows of a frame; the first ones say how far off the lenses may be, and begin to
         estimate the field.
 
-        Where the rows' field grows much later, as a camera has been moved in its mount or the first
-        matches were wrong ones, the columns are in doubt again.
+        Where the rows' field grows much later, or moves, as a camera has been moved in its mount or
+        the first matches were wrong ones, the columns are in doubt again.
         """
         if self.settings.calibrate_stereo == "off" or self.camera.kind != "stereo":
             return
         self._rows.update(seen)
         self._field = None
         if self._rows.offset_px is None:
+            return
+        moved_px = self._rows.moved_px
+        if "stereo_field" in window.state and moved_px > _ROWS_MOVED * _LEAST_ROWS * self.camera.fu:
+            # A turn of which the rows show this part moves columns as much.
+            sigmas = field_sigmas(self.camera, moved_px, stereo_yaw_rad(self.settings))
+            window.prior.inflate(window.state["stereo_field"], sigmas**2)
+            self._rows.forget()
+            self._rows.update(seen)
             return
         off = rows_off(self.camera, self._rows.offset_px)
         begins = "stereo_field" not in window.state

@@ -15,6 +15,7 @@ for improved odometry accuracy, ECMR (2021).
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import field
 from functools import lru_cache
 
@@ -29,6 +30,7 @@ from vio.filters.track_records import Eliminated, Residuals, RowEquations, TermC
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, project
 from vio.numerics.compiled import invert_positive, solve_positive
+from vio.numerics.robust import median
 from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, BoolArray, IntArray, Observations
 
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
@@ -36,6 +38,7 @@ _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
 # standard deviation of the rows' coefficients before the first frame, over the noise of a row
 _ROW_PRIOR_PX = 10.0
 _ROW_PRIOR: FloatArray = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
+_SHIFT_FRAMES = 5  # frames together, about half a window, that show whether the rows have moved
 
 
 class VerticalDisparityModel:
@@ -45,6 +48,12 @@ class VerticalDisparityModel:
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew, as the rig is another one."""
+        # medians of the last frames' rows less what was learned before them, px
+        self._shifts: deque[float] = deque(maxlen=_SHIFT_FRAMES)
         self._A: FloatArray = _ROW_PRIOR.copy()
         self._b: FloatArray = np.zeros(ROW_TERMS)
         # of A with the prior
@@ -65,9 +74,12 @@ class VerticalDisparityModel:
         camera = self._camera
         basis, common = vertical_disparity_terms(camera, z)
         rows = z[:, 3] - z[:, 1]
+        left = rows - camera.fv * (basis @ self.coefficients)
+        if self._matches:
+            self._shifts.append(median(left))
         # The median is taken out, as in the first frames the field itself is not yet known.
         weight = np.empty(len(z))
-        loops.weigh_rows(rows - camera.fv * (basis @ self.coefficients), CAUCHY, weight)
+        loops.weigh_rows(left, CAUCHY, weight)
         learned = RowEquations(self._A, self._b, self._common)
         loops.add_rows(basis, common, rows, weight, _ROW_MEMORY, learned)
         solution = self._b.copy()
@@ -106,6 +118,14 @@ class VerticalDisparityModel:
         shared = max(self._count / max(self._matches, 1), 1.0)
         noise = self._squares / max(self._count, 1.0) if self._count else 1.0
         return np.asarray(noise * shared / self._camera.fv**2 * self._inverse, dtype=np.float64)
+
+    @property
+    def moved_px(self) -> float:
+        """By how much the rows of the last frames are off from what was learned before, all of
+        them alike.
+        """
+        full = len(self._shifts) == _SHIFT_FRAMES
+        return abs(sum(self._shifts)) / _SHIFT_FRAMES if full else 0.0
 
     @property
     def offset_px(self) -> float | None:
