@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from tests.board_views import GRID, LEFT
-from tests.calibration.test_camera_imu import DENSITIES, OFFSET_S, RATE_HZ, T_CAM_IMU, _errors
-from tests.calibration.test_camera_imu import _pose as hand_pose
+from tests.calibration.test_camera_imu import (
+    DENSITIES,
+    OFFSET_S,
+    T_CAM_IMU,
+    _errors,
+    hand_imu,
+    hand_pose,
+)
 from vio.filters.imu_terms import CHOSEN, ImuTerms, term_sigmas
 from vio.geometry.distortion import project_point
 from vio.geometry.lie import (
@@ -15,42 +21,17 @@ from vio.geometry.lie import (
     se3_from_parts,
     se3_inverse,
     so3_exp,
-    so3_log,
     transform_points,
 )
-from vio.records import ImuRecord, imu_matrices
 from vio.targets.bundle import RigFit
 from vio.targets.corners import Corners
-from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
+from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu, poses_by_known_lens
 from vio.targets.rendering import board_points
 from vio.targets.start import pose_only
 from vio.targets.views import View, sightings
 
 NOISE_PX = 0.1
 VIEW_STEP_S = 0.2
-
-
-def _imu(seed: int, seconds: float, terms: FloatArray) -> ImuRecord:
-    """An IMU on a hand, with white noise and walking biases; scale and misalignment by `terms`."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(0, seconds, 1 / RATE_HZ)
-    h = 1e-4
-    before, now, after = (hand_pose(t + d, seed, 1.0) for d in (-h, 0.0, h))
-    R = now[:, :3, :3]
-    gyro = so3_log(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]) / (2 * h)
-    a = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / h**2
-    accel = np.einsum("nji,nj->ni", R, a + np.array([0, 0, 9.81]))
-    root = np.sqrt(RATE_HZ)
-    M_accel, M_gyro = imu_matrices(terms)
-    out = []
-    for values, M, bias, white, walk in (
-        (gyro, M_gyro, [0.01, -0.02, 0.005], DENSITIES.gyro, DENSITIES.gyro_walk),
-        (accel, M_accel, [0.1, 0.05, -0.08], DENSITIES.accel, DENSITIES.accel_walk),
-    ):
-        noise = np.cumsum(walk / root * rng.normal(size=values.shape), axis=0)
-        noise += white * root * rng.normal(size=values.shape)
-        out.append((values + bias + noise) @ np.linalg.inv(M).T)
-    return ImuRecord(np.round(1e9 * t).astype(np.int64), out[0], out[1])
 
 
 def _poses(seed: int, seconds: float, size: float = 1.0) -> BoardPoses:
@@ -75,8 +56,8 @@ def _poses(seed: int, seconds: float, size: float = 1.0) -> BoardPoses:
     problem, found = pose_only(fit, seen_all)
     good = np.bincount(seen_all.view[found.used], minlength=len(views)) >= 12
     times = np.array([view.time_ns for view in views], dtype=np.int64)
-    information = problem.pose_information(found)
-    return BoardPoses(times[good], found.at.T_cam0_board[good], information[good])
+    information, _ = problem.pose_information(found)
+    return poses_by_known_lens(times[good], found.at.T_cam0_board[good], information[good])
 
 
 def _found(
@@ -84,7 +65,7 @@ def _found(
 ) -> tuple[CameraImu, FloatArray]:
     """The calibration, and the terms that are true; `wrong`: standard deviations they are off by."""
     true = wrong * term_sigmas() * np.random.default_rng(seed).normal(size=15)
-    record = _imu(seed, seconds, true)
+    record = hand_imu(seed, seconds, true)
     return calibrate_imu(_poses(seed, seconds, size), record, DENSITIES, terms=terms), true
 
 
