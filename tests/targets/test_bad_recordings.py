@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -118,6 +119,18 @@ def test_names_cameras_that_never_see_the_board_together(
     folder = _changed(board_pairs, tmp_path / "pairs", in_turns, 16)
     message = _refusal(folder, board_file, capsys)
     assert "the cameras see the board together in 0 frames, and 4 are needed" in message
+
+
+def test_names_a_camera_that_is_out_of_focus(
+    board_pairs: Path, board_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blur = _right_alone(lambda image: np.asarray(cv2.GaussianBlur(image, (0, 0), 3.0), float))
+    folder = _changed(board_pairs, tmp_path / "pairs", blur, 12)
+    command = ["calibrate-rig", str(folder), "--target", str(board_file), "--lens", "radtan"]
+    assert main([*command, "--out", str(tmp_path / "rig")]) == 0
+    assert re.search(
+        "the right camera's corners are [0-9.]+ times less accurate", capsys.readouterr().out
+    )
 
 
 TEXT = target_text(SMALL)

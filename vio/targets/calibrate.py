@@ -210,7 +210,7 @@ def _check_views(filmed: Filmed, target: Target) -> None:
             raise DataError(
                 f"the {name} camera sees the board in {count} of {filmed.frames} frames, and "
                 f"{MIN_VIEWS} are needed; check that the target file is that of the board, move it "
-                "closer, light it well, and record 30 s of it at several distances and tilts"
+                "closer, light it well, focus, and record 30 s of it at several distances and tilts"
             )
         places = _places(filmed, c)
         if places < MIN_VIEWS:
