@@ -9,8 +9,14 @@ import numpy as np
 
 from vio.datasets.images import write_png
 from vio.geometry.distortion import CameraModel, project_point
-from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, transform_points
-from vio.records import BoolArray, IntArray
+from vio.geometry.lie import (
+    FloatArray,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+    transform_points,
+)
+from vio.records import BoolArray, ImuRecord, IntArray
 from vio.targets.corners import Corners
 from vio.targets.description import Target
 from vio.targets.rendering import BoardRenderer, Exposure, board_points
@@ -129,3 +135,31 @@ def render_pairs(folder: Path, count: int, seed: int = 0, target: Target = SMALL
             image = renderer.render(T, Exposure(0.6, 2.0, seed=100 * k + len(name)))
             write_png(folder / name / f"{k:04d}.png", image)
     return folder
+
+
+def render_record(folder: Path, seconds: float, seed: int, rate_hz: float = 5.0) -> Path:
+    """Write the images of one camera that a hand moves before a board, and its IMU's samples."""
+    from tests.calibration.test_camera_imu import OFFSET_S, T_CAM_IMU, hand_imu, hand_pose
+
+    (folder / "left").mkdir(parents=True)
+    shots = np.arange(0.2, seconds - 0.2, 1 / rate_hz)
+    centre = np.array([*(0.5 * np.array(SMALL.extent_m)), 0.0])
+    R = so3_exp([0.3, 0.2, 0.1])
+    T_cam_board = se3_from_parts(R, [0.0, 0.0, 0.5] - R @ centre)
+    T_world_board = se3_inverse(T_CAM_IMU) @ T_cam_board
+    poses = T_CAM_IMU @ se3_inverse(hand_pose(shots, seed, 1.0)) @ T_world_board
+    renderer = BoardRenderer(SMALL, SMALL_LEFT)
+    for k, T in enumerate(poses):
+        image = renderer.render(T, Exposure(0.6, 2.0, seed=k))
+        write_png(folder / "left" / f"{k:04d}.png", image)
+    times = [f"{second - OFFSET_S:.9f}" for second in shots.tolist()]
+    (folder / "times.txt").write_text("\n".join(times) + "\n")
+    write_imu(folder / "imu.csv", hand_imu(seed, seconds, np.zeros(15)))
+    return folder
+
+
+def write_imu(file: Path, imu: ImuRecord) -> None:
+    """Write samples as a plain folder has them."""
+    rows = np.column_stack([1e-9 * imu.times_ns, imu.gyro, imu.accel])
+    header = "timestamp,wx,wy,wz,ax,ay,az"
+    np.savetxt(file, rows, "%.9f", ",", header=header, comments="")

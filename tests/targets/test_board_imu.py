@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.board_views import GRID, LEFT
-from tests.calibration.test_camera_imu import DENSITIES, OFFSET_S, RATE_HZ, T_CAM_IMU, _errors
-from tests.calibration.test_camera_imu import _pose as hand_pose
+from tests.calibration.test_camera_imu import (
+    DENSITIES,
+    OFFSET_S,
+    T_CAM_IMU,
+    _errors,
+    hand_imu,
+    hand_pose,
+)
 from vio.filters.imu_terms import CHOSEN, ImuTerms, term_sigmas
 from vio.geometry.distortion import project_point
 from vio.geometry.lie import (
@@ -15,11 +23,9 @@ from vio.geometry.lie import (
     se3_from_parts,
     se3_inverse,
     so3_exp,
-    so3_log,
     transform_points,
 )
-from vio.records import ImuRecord, imu_matrices
-from vio.targets.bundle import RigFit
+from vio.targets.bundle import RigFit, layout_of, lens_moved
 from vio.targets.corners import Corners
 from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
 from vio.targets.rendering import board_points
@@ -30,31 +36,10 @@ NOISE_PX = 0.1
 VIEW_STEP_S = 0.2
 
 
-def _imu(seed: int, seconds: float, terms: FloatArray) -> ImuRecord:
-    """An IMU on a hand, with white noise and walking biases; scale and misalignment by `terms`."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(0, seconds, 1 / RATE_HZ)
-    h = 1e-4
-    before, now, after = (hand_pose(t + d, seed, 1.0) for d in (-h, 0.0, h))
-    R = now[:, :3, :3]
-    gyro = so3_log(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]) / (2 * h)
-    a = (after[:, :3, 3] - 2 * now[:, :3, 3] + before[:, :3, 3]) / h**2
-    accel = np.einsum("nji,nj->ni", R, a + np.array([0, 0, 9.81]))
-    root = np.sqrt(RATE_HZ)
-    M_accel, M_gyro = imu_matrices(terms)
-    out = []
-    for values, M, bias, white, walk in (
-        (gyro, M_gyro, [0.01, -0.02, 0.005], DENSITIES.gyro, DENSITIES.gyro_walk),
-        (accel, M_accel, [0.1, 0.05, -0.08], DENSITIES.accel, DENSITIES.accel_walk),
-    ):
-        noise = np.cumsum(walk / root * rng.normal(size=values.shape), axis=0)
-        noise += white * root * rng.normal(size=values.shape)
-        out.append((values + bias + noise) @ np.linalg.inv(M).T)
-    return ImuRecord(np.round(1e9 * t).astype(np.int64), out[0], out[1])
-
-
-def _poses(seed: int, seconds: float, size: float = 1.0) -> BoardPoses:
-    """Poses by corners of a board that is `size` times as large as its file says."""
+def _poses(seed: int, seconds: float, size: float = 1.0, lens_sigma_px: float = 0.0) -> BoardPoses:
+    """Poses by corners of a board that is `size` times as large as its file says, and by a lens
+    whose focal lengths and centre were calibrated with errors.
+    """
     rng = np.random.default_rng(1000 + seed)
     shots = np.arange(VIEW_STEP_S, seconds - VIEW_STEP_S, VIEW_STEP_S)
     points = size * board_points(GRID)
@@ -71,12 +56,16 @@ def _poses(seed: int, seconds: float, size: float = 1.0) -> BoardPoses:
             noisy = uv[ids] + NOISE_PX * rng.normal(size=(len(ids), 2))
             views.append(View(round(1e9 * (second - OFFSET_S)), (Corners(ids, noisy),)))
     seen_all = sightings(views, GRID.points_m)
-    fit = RigFit((LEFT,), np.eye(4)[None], np.zeros((1, 4, 4)), np.zeros(2))
+    sigma = np.zeros(layout_of((LEFT,)).size)
+    sigma[:4] = lens_sigma_px
+    lens = lens_moved(LEFT, (sigma * rng.normal(size=len(sigma)))[:8])
+    fit = RigFit((lens,), np.eye(4)[None], np.zeros((1, 4, 4)), np.zeros(2))
     problem, found = pose_only(fit, seen_all)
     good = np.bincount(seen_all.view[found.used], minlength=len(views)) >= 12
     times = np.array([view.time_ns for view in views], dtype=np.int64)
-    information = problem.pose_information(found)
-    return BoardPoses(times[good], found.at.T_cam0_board[good], information[good])
+    information, xi_D_lens = problem.pose_information(found)
+    T = found.at.T_cam0_board[good]
+    return BoardPoses(times[good], T, information[good], xi_D_lens[good], np.diag(sigma**2))
 
 
 def _found(
@@ -84,7 +73,7 @@ def _found(
 ) -> tuple[CameraImu, FloatArray]:
     """The calibration, and the terms that are true; `wrong`: standard deviations they are off by."""
     true = wrong * term_sigmas() * np.random.default_rng(seed).normal(size=15)
-    record = _imu(seed, seconds, true)
+    record = hand_imu(seed, seconds, true)
     return calibrate_imu(_poses(seed, seconds, size), record, DENSITIES, terms=terms), true
 
 
@@ -105,6 +94,23 @@ def _check(seeds: range, seconds: float, low: float, high: float) -> None:
 
 def test_errors_are_those_of_the_covariance() -> None:
     _check(range(2), 15.0, 5.6, 26.1)  # 95 % of 14 degrees of freedom
+
+
+def test_the_covariance_holds_the_errors_of_the_lens() -> None:
+    """They are common to all poses, so that no number of views averages them out."""
+    nees = []
+    nees_of_known_lens = []
+    for seed in range(3):
+        record = hand_imu(seed, 15.0, np.zeros(15))
+        poses = _poses(seed, 15.0, lens_sigma_px=0.3)
+        found = calibrate_imu(poses, record, DENSITIES)
+        error = _errors(found)
+        nees.append(float(error @ np.linalg.solve(found.covariance, error)))
+        known = replace(poses, lens_covariance=np.zeros_like(poses.lens_covariance))
+        P = calibrate_imu(known, record, DENSITIES).covariance
+        nees_of_known_lens.append(float(error @ np.linalg.solve(P, error)))
+    assert 8 < sum(nees) < 41  # 99 % of chi-square with 21 degrees of freedom
+    assert sum(nees_of_known_lens) > 80
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ from tests.board_views import (
     T_RIGHT_LEFT,
     Flaws,
     made_views,
-    render_pairs,
 )
 from vio import load_rig
 from vio.cli import main
@@ -481,18 +480,13 @@ def test_says_what_to_record_where_views_are_missing() -> None:
         calibrate_cameras(_filmed(apart), GRID)
 
 
-@pytest.fixture(scope="module")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return render_pairs(tmp_path_factory.mktemp("board") / "pairs", 10)
-
-
 def test_the_command_calibrates_a_folder_of_pairs(
-    rendered: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    board_pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "target.yaml"
     target.write_text(target_text(SMALL))
     out = tmp_path / "rig"
-    command = ["calibrate-rig", str(rendered), "--target", str(target), "--lens", "radtan"]
+    command = ["calibrate-rig", str(board_pairs), "--target", str(target), "--lens", "radtan"]
     assert main([*command, "--out", str(out)]) == 0
     assert "vio run" in capsys.readouterr().out
     facts = json.loads((out / "calibration.json").read_text())
@@ -509,7 +503,7 @@ def test_the_command_calibrates_a_folder_of_pairs(
         assert np.allclose(other.right[1], kalibr.right[1], atol=1e-6)
         assert np.allclose(other.cam0.K, kalibr.cam0.K)
     settings = DatasetSettings(calibration=out / "camchain-imucam.yaml")
-    dataset = open_dataset(rendered, settings)  # as vio run --calibration does
+    dataset = open_dataset(board_pairs, settings)  # as vio run --calibration does
     assert dataset.recording.camera.baseline_m == pytest.approx(0.11, abs=1e-3)
     basalt = json.loads((out / "basalt.json").read_text())["value0"]
     assert basalt["intrinsics"][0]["camera_type"] == "pinhole-radtan8"
@@ -517,11 +511,11 @@ def test_the_command_calibrates_a_folder_of_pairs(
 
 
 def test_another_board_is_refused_in_one_line(
-    rendered: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    board_pairs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "target.yaml"
     target.write_text(target_text(Target("charuco", 5, 7, 0.04, 0.7, "DICT_4X4_50")))
-    assert main(["calibrate-rig", str(rendered), "--target", str(target)]) == 1
+    assert main(["calibrate-rig", str(board_pairs), "--target", str(target)]) == 1
     message = capsys.readouterr().err
     assert "the images show an AprilGrid with tags 0 to 11" in message
     assert "give the file of the board that was recorded" in message

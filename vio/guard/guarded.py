@@ -11,8 +11,8 @@ from vio.guard.frozen_image import FrozenCamera
 from vio.guard.image_check import FrameImages, ImageCheck, images_of
 from vio.guard.match_check import without_right
 from vio.guard.matches import RightMatches
-from vio.guard.object_matches import ObjectMatches
 from vio.guard.never_matched import NeverMatched
+from vio.guard.object_matches import ObjectMatches
 from vio.guard.pairing import PairingCheck
 from vio.guard.probe import RowProbe
 from vio.guard.swap import SwapDetector

@@ -114,7 +114,21 @@ class BoardAdjustment:
         self._bow_sigma_m = _BOW_SHARE * float(np.ptp(seen.points_m, axis=0).max())
 
     def solve(self, start: RigFit, steps: int = _STEPS) -> Adjusted:
-        """Return the optimum from a start on."""
+        """Return the optimum from a start on.
+
+        Raises:
+            CalibrationError: the views do not determine the lens.
+        """
+        try:
+            return self._solved(start, steps)
+        except np.linalg.LinAlgError as error:
+            raise CalibrationError(
+                f"the views do not determine a {start.cameras[0].model} lens with "
+                f"{len(start.cameras[0].coefficients)} coefficients: show the board in every part "
+                "of the images, tilted, or choose a lens with fewer by --lens"
+            ) from error
+
+    def _solved(self, start: RigFit, steps: int) -> Adjusted:
         at = self._descend(start, steps, cut=False)
         at = self._descend(at, steps, cut=True)
         r = self._residuals(at)
@@ -129,13 +143,13 @@ class BoardAdjustment:
         back = np.argsort(self._order)
         return Adjusted(at, sigma, 0.5 * (covariance + covariance.T), used[back], r[back])
 
-    def pose_information(self, found: Adjusted) -> FloatArray:
-        """Return the inverse covariance (V, 6, 6) of xi in `exp(xi) T_cam0_board` of each view,
-        lenses and pair as known.
+    def pose_information(self, found: Adjusted) -> tuple[FloatArray, FloatArray]:
+        """Return what is known of xi in `exp(xi) T_cam0_board` of each view: its inverse covariance
+        (V, 6, 6), lenses and pair as known, and its derivative (V, 6, S) by these, see `Layout`.
         """
         used = found.used[self._order]
-        A = self._normal(found.at, used / found.sigma_px[self.seen.camera] ** 2)[0]
-        return np.asarray(A)
+        A, B, _, _, _ = self._normal(found.at, used / found.sigma_px[self.seen.camera] ** 2)
+        return np.asarray(A), np.asarray(-np.linalg.solve(A, B))
 
     def _descend(self, at: RigFit, steps: int, *, cut: bool) -> RigFit:
         damping = 1e-4

@@ -11,10 +11,11 @@ import numpy as np
 from vio.cameras.rig import Rig
 from vio.errors import CalibrationError, DataError
 from vio.filters.imu_terms import ImuTerms
-from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.lie import FloatArray, se3_inverse, so3_log
 from vio.numerics.robust import median
 from vio.records import ImuDensities, IntArray
 from vio.targets.bundle import Adjusted, BoardAdjustment
+from vio.targets.corners import Corners
 from vio.targets.description import Target
 from vio.targets.diagnosis import diagnose
 from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
@@ -30,6 +31,9 @@ _DOUBT_SIGMAS = 2.0  # stated, beyond which another lens model's difference is n
 _MIN_DOUBT_PX = 0.1
 _MAX_REFUSED = 0.3  # of a pair's corners, beyond which it is none
 _MAX_RESIDUAL_PX = 3.0  # beyond which the board or the lens is another one
+_SAME_PLACE_PX = 2.0  # between the corners of two images, below which they show one view
+_DOUBTFUL_PX = 0.5  # residual beyond which the images are asked whether the board is the file's
+_MAX_TURN_DEG = 90.0  # of a pair's cameras against each other, which no rectification holds
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,8 +153,15 @@ def calibrate_with_imu(
     used = np.bincount(seen.view[found.used & (seen.camera == 0)], minlength=seen.views)
     good = np.flatnonzero(used >= _MIN_CORNERS)
     times_ns = np.array([filmed.views[v].time_ns for v in chosen[good].tolist()], dtype=np.int64)
-    information = problem.pose_information(found) / cameras.verdict.inflation**2
-    poses = BoardPoses(times_ns, found.at.T_cam0_board[good], information[good])
+    information, xi_D_lens = problem.pose_information(found)
+    variance = cameras.verdict.inflation**2
+    poses = BoardPoses(
+        times_ns,
+        found.at.T_cam0_board[good],
+        information[good] / variance,
+        xi_D_lens[good],
+        cameras.found.covariance * variance,
+    )
     return calibrate_imu(poses, filmed.imu, densities, terms=terms)
 
 
@@ -191,10 +202,22 @@ def _check_views(filmed: Filmed, target: Target) -> None:
         if count < MIN_VIEWS:
             if (reason := _diagnosis(filmed, c, target)) is not None:
                 raise DataError(f"{name} camera: {reason}")
+            if count == filmed.frames:
+                raise DataError(
+                    f"the {name} camera sees the board in all {count} frames, and {MIN_VIEWS} are "
+                    "needed: record 30 s of it at several distances and tilts"
+                )
             raise DataError(
                 f"the {name} camera sees the board in {count} of {filmed.frames} frames, and "
                 f"{MIN_VIEWS} are needed; check that the target file is that of the board, move it "
-                "closer, light it well, and record 30 s of it at several distances and tilts"
+                "closer, light it well, focus, and record 30 s of it at several distances and tilts"
+            )
+        places = _places(filmed, c)
+        if places < MIN_VIEWS:
+            raise DataError(
+                f"the {name} camera sees the board in {count} frames, and of these only {places} "
+                f"differ, and {MIN_VIEWS} are needed: move the board or the camera between the images, nearer "
+                "and farther, and tilt it"
             )
     together = sum(min(map(len, view.corners)) >= _MIN_CORNERS for view in filmed.views)
     if together < MIN_VIEWS // 2:
@@ -204,10 +227,37 @@ def _check_views(filmed: Filmed, target: Target) -> None:
         )
 
 
+def _places(filmed: Filmed, camera: int) -> int:
+    """Return how many views of a camera differ from each other, at most `MIN_VIEWS`.
+
+    Frames at standstill repeat a view: they average its noise, and show no more of the lens.
+    """
+    known: list[Corners] = []
+    for view in filmed.views:
+        corners = view.corners[camera]
+        if len(corners) < _MIN_CORNERS:
+            continue
+        if all(_apart_px(corners, other) > _SAME_PLACE_PX for other in known):
+            known.append(corners)
+        if len(known) == MIN_VIEWS:
+            break
+    return len(known)
+
+
+def _apart_px(a: Corners, b: Corners) -> float:
+    """Return the median distance of the corners that two images show; infinite: they show none."""
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    if not len(in_a):
+        return float("inf")
+    return median(np.linalg.norm(a.uv[in_a] - b.uv[in_b], axis=1))
+
+
 def _check_fit(one: Adjusted, camera: int, filmed: Filmed, target: Target) -> None:
     residual = median(np.linalg.norm(one.residuals_px, axis=1))
-    if residual > _MAX_RESIDUAL_PX:
-        reason = _diagnosis(filmed, camera, target)
+    if residual < _DOUBTFUL_PX:
+        return
+    reason = _diagnosis(filmed, camera, target)
+    if reason is not None or residual > _MAX_RESIDUAL_PX:
         advice = reason or "check rows, columns, tag spacing and numbering in the target file"
         raise CalibrationError(
             f"camera {camera}: corners are off by {residual:.1f} px (median) with the best lens; "
@@ -226,7 +276,14 @@ def _check_pair(found: Adjusted) -> None:
             f"{100 * refused:.0f} % of them by more; pair the images by their times, or hold the "
             "board still for each pair"
         )
-    x, y, _ = (se3_inverse(found.at.T_cam_cam0[1])[:3, 3]).tolist()
+    T_cam1_cam0 = found.at.T_cam_cam0[1]
+    turn_deg = float(np.degrees(np.linalg.norm(so3_log(T_cam1_cam0[:3, :3]))))
+    if turn_deg > _MAX_TURN_DEG:
+        raise DataError(
+            f"the right camera is turned by {turn_deg:.0f} degrees against the left one: turn the "
+            "images of one of them, or calibrate each camera alone"
+        )
+    x, y, _ = (se3_inverse(T_cam1_cam0)[:3, 3]).tolist()
     if x < -abs(y):
         raise DataError(
             "the right camera is to the left of the left one, as its images see it: exchange left "

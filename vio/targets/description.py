@@ -11,6 +11,7 @@ targets" of Kalibr's documentation; OpenCV's `calibration.cpp` sample; BoofCV's
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +32,11 @@ Bits: TypeAlias = npt.NDArray[np.bool_]
 APRILTAG = "DICT_APRILTAG_36h11"
 _KALIBR_BORDER_BITS = 2
 _CHARUCO_BORDER_BITS = 1
+_FAMILY_KEYS = (
+    "dictionary",
+    "tagFamily",
+    "family",
+)  # by which other tools name an AprilGrid's tags
 MAX_SIZE_M = 1.0  # of a tag or square; a larger value is in millimetres
 MAX_COUNT = 100  # tags or squares along a side
 KNOWN = (
@@ -119,7 +125,7 @@ class Target:
     def markers(self) -> list[Marker]:
         """Return the coded squares; none on a checkerboard."""
         return [
-            Marker(self.first_id + n, found, self._modules(self.first_id + n))
+            Marker(self.first_id + n, found, self.modules_of(self.first_id + n))
             for n, found in enumerate(self.marker_corners())
         ]
 
@@ -146,7 +152,12 @@ class Target:
         flipped = self.kind == "charuco" and self.legacy and self.rows % 2 == 0
         return (row + col + flipped) % 2 == 0
 
-    def _modules(self, number: int) -> Bits:
+    def modules_of(self, number: int) -> Bits:
+        """Return which modules (M, M) of the marker with an id are dark.
+
+        Raises:
+            CalibrationError: the dictionary has no such marker.
+        """
         import cv2
 
         dictionary = marker_dictionary(self.dictionary)
@@ -216,8 +227,10 @@ def marker_dictionary(name: str) -> Any:
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if not isinstance(number, int):
         known = sorted(key for key in dir(cv2.aruco) if key.startswith("DICT_"))
+        near = difflib.get_close_matches(name, known, 2) or ["DICT_4X4_50", "DICT_6X6_250"]
         raise CalibrationError(
-            f"{name!r} is no dictionary of OpenCV's markers; known: {', '.join(known)}"
+            f"{name!r} is no dictionary of OpenCV's markers; give its name, such as "
+            f"{' or '.join(near)}"
         )
     return cv2.aruco.getPredefinedDictionary(number)
 
@@ -268,16 +281,27 @@ def read_target(path: Path, size_m: float | None = None) -> Target:
     """
     if not path.is_file():
         raise CalibrationError(f"{path} is no file; give {KNOWN}, or write one by vio target")
+    if not path.read_bytes().strip():
+        raise CalibrationError(f"{path}: is empty; give {KNOWN}, or write one by vio target")
     if path.suffix.lower() == ".xml":
         entries: Mapping[str, Any] = read_entries(path)
     else:
         entries = read_yaml_file(path, "the description of a board")
     try:
         target = _from_entries(entries, path, size_m)
+        _check_markers(target)
     except CalibrationError as error:
         text = str(error)
         raise CalibrationError(text if str(path) in text else f"{path}: {text}") from error
     return target
+
+
+def _check_markers(target: Target) -> None:
+    """Refuse a board that needs more markers than its dictionary has."""
+    needed = len(target.marker_corners())
+    if needed:
+        target.modules_of(target.first_id)
+        target.modules_of(target.first_id + needed - 1)
 
 
 def _kind_by_entries(entries: Mapping[str, Any]) -> str:
@@ -322,7 +346,7 @@ class _Entries:
         if key is None:
             raise CalibrationError(f"{self.path}: has no entry '{keys[0]}'; add it")
         value = as_number(self.entries[key])
-        if not np.isfinite(value):
+        if not np.isfinite(value) or isinstance(self.entries[key], bool):
             raise CalibrationError(f"{self.path}: '{key}' is {self.entries[key]!r}, no number")
         return value
 
@@ -333,6 +357,20 @@ class _Entries:
             raise CalibrationError(f"{self.path}: '{keys[0]}' is {value:g}, no whole number")
         return int(value)
 
+    def ratio(self, part: tuple[str, ...], whole: tuple[str, ...]) -> float:
+        """Return the ratio of two lengths."""
+        length = self.number(*whole)
+        if length <= 0:
+            raise CalibrationError(f"{self.path}: '{whole[0]}' is {length:g}, no length in metres")
+        return self.number(*part) / length
+
+    def flag(self, key: str) -> bool:
+        """Return whether an entry is true; one that is missing is not."""
+        value = self.entries.get(key, False)
+        if value not in (True, False):
+            raise CalibrationError(f"{self.path}: '{key}' is {value!r}; write true or false")
+        return bool(value)
+
     def side(self, *keys: str) -> float:
         """Return the side of a tag or square."""
         stated = self.number(*keys)
@@ -340,6 +378,13 @@ class _Entries:
 
     def aprilgrid(self) -> Target:
         """Read Kalibr's (and Basalt's) AprilGrid."""
+        for key in _FAMILY_KEYS:
+            family = str(self.entries.get(key, "36h11")).lower()
+            if not family.endswith("36h11"):
+                raise CalibrationError(
+                    f"{self.path}: '{key}' is {self.entries[key]!r}, and an AprilGrid is read with "
+                    "tags of 36h11, as Kalibr prints it; print such a board by vio target"
+                )
         offset = self.count("codeOffset") if "codeOffset" in self.entries else 0
         return Target(
             "aprilgrid",
@@ -363,9 +408,7 @@ class _Entries:
 
     def charuco(self) -> Target:
         """Read a ChArUco board by the names of OpenCV's class."""
-        ratio = self.number("markerSize", "markerLength") / self.number(
-            "squareSize", "squareLength"
-        )
+        ratio = self.ratio(("markerSize", "markerLength"), ("squareSize", "squareLength"))
         return Target(
             "charuco",
             self.count("squaresY"),
@@ -373,7 +416,7 @@ class _Entries:
             self.side("squareSize", "squareLength"),
             ratio,
             str(self.entries.get("dictionary", "DICT_4X4_50")),
-            legacy=bool(self.entries.get("legacyPattern", False)),
+            legacy=self.flag("legacyPattern"),
         )
 
     def opencv(self) -> Target:
@@ -388,7 +431,7 @@ class _Entries:
             raise CalibrationError(
                 f"{self.path}: Calibrate_Pattern {kind} is not read; print a board by vio target"
             )
-        ratio = self.number("Marker_Size") / self.number("Square_Size")
+        ratio = self.ratio(("Marker_Size",), ("Square_Size",))
         name = str(self.entries.get("ArUco_Dict_Name", "DICT_4X4_50")).strip('"')
         return Target("charuco", height, width, side, ratio, name)
 

@@ -1,4 +1,6 @@
-"""Why a board is not found in images: they are mirrored, or it is another one than in the file."""
+"""Why a board is not found in images: they are mirrored, inverted, too bright or too dark, or it is
+another board than in the file.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +24,12 @@ _MARKER_SHARES = (0.5, 0.6, 0.7, 0.75, 0.8)
 _MUCH_BETTER = 0.4  # misfit over that of the file's board, below which another one is named
 _MAX_MISFIT = 0.15  # of a marker's side, of the board that is named
 _WINDOW_SHARE = 0.12  # of a marker's side: half the window in which its corners are refined
+# as many corners in mirrored or inverted images, from which on the images are called so
+_MIRRORED_TIMES = 4
+_WHITE = np.uint8(255)
+_MAX_BRIGHT = 0.3  # of the pixels, with the largest value: paper and more
+_TOP_PERCENT = 99
+_MIN_TOP = 40.0  # of `_WHITE`: the contrast of a print below it is that of noise
 _COMPARED = 9  # markers by which boards are compared
 _MARKERS_TRIED = 100  # numbers that are read
 # Dictionaries of which all smaller ones of a size are the beginning.
@@ -44,17 +52,50 @@ def diagnose(images: Sequence[Image], target: Target) -> str | None:
         target: the board as described.
     """
     detector = CornerDetector(target)
-    seen = sum(len(detector.detect(image)) > 0 for image in images)
+    found = [len(detector.detect(image)) for image in images]
+    seen = sum(found)
+    if (dark := _darkness(images)) is not None:
+        return dark
     if target.kind != "checkerboard":
+        # In mirrored images hardly a marker is read, which leaves nothing to arrange.
+        if (other := _other_arrangement(images, target)) is not None:
+            return other
         turned = [np.ascontiguousarray(image[:, ::-1]) for image in images]
-        if sum(len(detector.detect(image)) > 0 for image in turned) > seen:
+        if sum(len(detector.detect(image)) for image in turned) > _MIRRORED_TIMES * seen:
             return (
                 "the images are mirrored: the board is found in their mirror images alone; record "
                 "them as the camera sees, without a flip"
             )
-        if (other := _other_arrangement(images, target)) is not None:
-            return other
-    return _other_kind(images, target, is_seen=seen > 0)
+        inverted = [np.subtract(_WHITE, image) for image in images]
+        if sum(len(detector.detect(image)) for image in inverted) > _MIRRORED_TIMES * seen:
+            return (
+                "the images are inverted, dark where the board is light: record them as the "
+                "camera sees"
+            )
+    is_seen = 2 * int(np.count_nonzero(found)) > len(found)
+    return _other_kind(images, target, is_seen=is_seen)
+
+
+def _darkness(images: Sequence[Image]) -> str | None:
+    """Say whether most images are too dark to show a board."""
+    top = median(np.array([np.percentile(image, _TOP_PERCENT) for image in images]))
+    if top > _MIN_TOP:
+        return None
+    return (
+        f"the images are dark, {_TOP_PERCENT} % of their pixels are below {top + 1:.0f} of "
+        f"{_WHITE}: record with more light, or a longer exposure"
+    )
+
+
+def _glare(images: Sequence[Image]) -> str | None:
+    """Say whether most images are too bright to show a board."""
+    bright = median(np.array([np.mean(image == _WHITE) for image in images]))
+    if bright < _MAX_BRIGHT:
+        return None
+    return (
+        f"the images are overexposed, {100 * bright:.0f} % of their pixels have the largest "
+        "value: shorten the exposure, or lower the gain"
+    )
 
 
 def _other_arrangement(images: Sequence[Image], target: Target) -> str | None:
@@ -160,6 +201,8 @@ def _other_kind(images: Sequence[Image], target: Target, *, is_seen: bool) -> st
         shown = _checkerboard_in(images, target)
     if shown is None and not is_seen:
         shown = _tags_in(images, target) or _markers_in(images, target)
+        if shown is None and (glare := _glare(images)) is not None:
+            return glare
         if shown is None and target.kind != "checkerboard":
             shown = _checkerboard_in(images, target)
     if shown is None:

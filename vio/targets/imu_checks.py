@@ -34,6 +34,14 @@ _MIRRORED = InertialFinding(
     "of its columns",
 )
 
+_STILL_SHARE = 0.1  # of the rates seen, below which those of the gyro are noise
+_STILL = InertialFinding(
+    "gyro disagrees",
+    "the IMU does not turn while the board turns before the camera",
+    "the board was moved, not the rig: fix the board, and turn and move the rig before it, camera "
+    "and IMU together",
+)
+
 
 def check_imu(
     times_ns: IntArray, T_cam0_board: FloatArray, rotation_sigma_rad: float, imu: ImuRecord
@@ -110,7 +118,7 @@ def _judge(record: Record, gyro_fit: GyroFit, size: Size) -> list[InertialFindin
     if _is_mirrored(gyro_fit, R):
         return [_MIRRORED]
     if gyro_fit.unexplained > AGREES:
-        return [_disagreement(gyro_fit)]
+        return [_STILL] if _is_still(record) else [_disagreement(gyro_fit)]
     evidence = _evidence(record, gyro_fit, size, R)
     size = resolve_size(size, evidence)
     found = judge_gyro(evidence, size.unit or 1.0)
@@ -120,6 +128,14 @@ def _judge(record: Record, gyro_fit: GyroFit, size: Size) -> list[InertialFindin
     if not axes_agree or size.unit is None:
         return found
     return found + [_of_both_sensors(f) for f in judge_force(evidence, size.unit, None)[0]]
+
+
+def _is_still(record: Record) -> bool:
+    """Return whether the gyro does not turn while the board turns before the camera."""
+    readings, _ = record.means(np.zeros(1))
+    own = readings[0, :, :3] - np.median(readings[0, :, :3], axis=0)
+    seen = np.linalg.norm(record.twists[:, 3:], axis=1)
+    return median(np.linalg.norm(own, axis=1)) < _STILL_SHARE * median(seen)
 
 
 def _disagreement(gyro_fit: GyroFit) -> InertialFinding:

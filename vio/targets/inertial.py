@@ -55,7 +55,18 @@ class BoardPoses:
 
     times_ns: IntArray  # (K,) by the camera's clock
     T_cam0_board: FloatArray  # (K, 4, 4)
-    information: FloatArray  # (K, 6, 6) of xi in `exp(xi) T_cam0_board`
+    information: FloatArray  # (K, 6, 6) of xi in `exp(xi) T_cam0_board`, by the corners' noise
+    xi_D_lens: FloatArray  # (K, 6, S) likewise by the unknowns that all views share, see `Layout`
+    lens_covariance: FloatArray  # (S, S) of those
+
+
+def poses_by_known_lens(
+    times_ns: IntArray, T_cam0_board: FloatArray, information: FloatArray
+) -> BoardPoses:
+    """Return poses of a board whose lens is known."""
+    return BoardPoses(
+        times_ns, T_cam0_board, information, np.zeros((len(times_ns), 6, 0)), np.zeros((0, 0))
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +160,11 @@ class _Problem:
                 "record a minute of the board with images and IMU"
             )
         self.poses = BoardPoses(
-            poses.times_ns[inside], poses.T_cam0_board[inside], poses.information[inside]
+            poses.times_ns[inside],
+            poses.T_cam0_board[inside],
+            poses.information[inside],
+            poses.xi_D_lens[inside],
+            poses.lens_covariance,
         )
         self._imu = imu
         self._gravity = gravity
@@ -320,23 +335,24 @@ class _Problem:
         return own, shared
 
     def _system(
-        self, at: _States, motions: _Motions, w: FloatArray, *, with_scale: bool = False
+        self, at: _States, motions: _Motions, w: FloatArray, further: FloatArray | None = None
     ) -> tuple[csc_matrix, FloatArray, float]:
-        """Normal equations; `with_scale`: the board's scale is one unknown more, the last one."""
+        """Normal equations; `further`: derivatives (K, 6, E) of the poses' whitened residuals by
+        unknowns that come last.
+        """
         steps = motions.steps
         K = len(self._seconds)
-        rows = _Rows(_STATE * K + self._shared + with_scale)
+        extra = 0 if further is None else further.shape[2]
+        rows = _Rows(_STATE * K + self._shared + extra)
         own, shared = self._camera_jacobian(at)
         scale = w[:, None, None]
         states = np.arange(K)
         common = np.tile(_STATE * K + np.arange(_SHARED), (K, 1))
         columns = _STATE * states[:, None] + np.arange(_STATE)
         blocks = [(columns, scale * own), (common, scale * shared)]
-        if with_scale:
-            ends = [self._camera(at, scale=1 + sign * _NUMERIC_STEP) for sign in (1.0, -1.0)]
-            by_scale = (ends[0] - ends[1]) / (2 * _NUMERIC_STEP)
-            last = np.full((K, 1), _STATE * K + self._shared)
-            blocks.append((last, scale * by_scale[:, :, None]))
+        if further is not None:
+            last = np.tile(_STATE * K + self._shared + np.arange(extra), (K, 1))
+            blocks.append((last, scale * further))
         rows.add(w[:, None] * self._camera(at), blocks)
         r, A, B = steps.linearised(
             at.body.take(slice(None, -1)), at.body.take(slice(1, None)), self._gravity
@@ -364,17 +380,18 @@ class _Problem:
         """Return the calibration with its covariance."""
         motions = self._motions(at)
         weight = self._weights(at)
-        H, _, _ = self._system(at, motions, weight)
-        shared = self._shared_covariance(H, self._shared)
+        by_lens = self._root @ self.poses.xi_D_lens
+        further = np.concatenate([self._camera_by_scale(at), by_lens], axis=2)
+        H, g, _ = self._system(at, motions, weight, further)
         inertial = float(np.mean(self._inertial(at, motions) ** 2))
-        shared = shared * max(inertial, 1.0)
+        shared = self._shared_covariance(H, self._shared, inertial)
         P = shared[:7, :7]
         sigmas = np.zeros(IMU_TERMS)
         sigmas[self._chosen] = np.sqrt(np.diag(shared)[_SHARED:])
-        H, g, _ = self._system(at, motions, weight, with_scale=True)
-        off = float(splu(H).solve(g)[-1])
-        variance = float(self._shared_covariance(H, self._shared + 1)[-1, -1])
-        off_sigma = float(np.sqrt(variance * max(inertial, 1.0)))
+        count = _STATE * len(self._seconds) + self._shared + 1
+        off = float(splu(H[:count, :count].tocsc()).solve(g[:count])[-1])
+        variance = float(self._shared_covariance(H, self._shared + 1, inertial)[-1, -1])
+        off_sigma = float(np.sqrt(variance))
         return CameraImu(
             at.T_cam0_imu,
             at.offset_s,
@@ -392,12 +409,30 @@ class _Problem:
             off_sigma,
         )
 
-    def _shared_covariance(self, H: csc_matrix, count: int) -> FloatArray:
-        """Covariance of the unknowns (count,) that follow the views' states."""
+    def _camera_by_scale(self, at: _States) -> FloatArray:
+        """Derivative (K, 6, 1) of the poses' whitened residuals by the board's scale."""
+        ends = [self._camera(at, scale=1 + sign * _NUMERIC_STEP) for sign in (1.0, -1.0)]
+        return np.asarray((ends[0] - ends[1]) / (2 * _NUMERIC_STEP))[:, :, None]
+
+    def _shared_covariance(self, H: csc_matrix, count: int, inertial: float) -> FloatArray:
+        """Covariance of the unknowns (count,) that follow the views' states.
+
+        Noise of corners and IMU averages out over the views. An error of the lens does not: all
+        poses have it in common, so its effect on the optimum is added.
+
+        Args:
+            H: normal equations, the board's scale and the lens last.
+            count: of the unknowns, those behind them taken as known.
+            inertial: mean squared whitened residual of the IMU, by which noise is inflated.
+        """
         first = _STATE * len(self._seconds)
-        wanted = np.zeros((H.shape[0], count))
+        free = first + count
+        lens = first + self._shared + 1
+        wanted = np.zeros((free, count))
         wanted[first + np.arange(count), np.arange(count)] = 1
-        P = splu(H).solve(wanted)[first : first + count]
+        solved = splu(H[:free, :free].tocsc()).solve(wanted)
+        by_lens = -solved.T @ H[:free, lens:].toarray()
+        P = max(inertial, 1.0) * solved[first:] + by_lens @ self.poses.lens_covariance @ by_lens.T
         return np.asarray(0.5 * (P + P.T))
 
 

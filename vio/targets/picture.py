@@ -51,7 +51,8 @@ def views_png(found: CameraCalibration) -> bytes:
     distance = np.linalg.norm(found.found.at.T_cam0_board[:, :3, 3], axis=1)
     axes[0][-1].hist(distance, bins=12)
     axes[0][-1].set_xlabel("distance, m")
-    axes[0][-1].set_title("views")
+    axes[0][-1].set_ylabel("views")
+    axes[0][-1].set_title("distances of the board")
     return _png(figure)
 
 
@@ -148,6 +149,8 @@ def _draw_residuals(axes: Any, found: CameraCalibration, c: int) -> None:
     axes.set_xlim(-limit, limit)
     axes.set_ylim(-limit, limit)
     axes.set_aspect("equal")
+    axes.set_xlabel("along u, px")
+    axes.set_ylabel("along v, px")
     axes.set_title(f"{_name(found, c)}: residuals, sigma {found.found.sigma_px[c]:.3f} px")
 
 
@@ -183,3 +186,5 @@ def _image_axes(axes: Any, camera: CameraModel) -> None:
     axes.set_xlim(-0.5, camera.width - 0.5)
     axes.set_ylim(camera.height - 0.5, -0.5)
     axes.set_aspect("equal")
+    axes.set_xlabel("u, px")
+    axes.set_ylabel("v, px")

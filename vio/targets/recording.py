@@ -209,6 +209,9 @@ def _with_stand_in(source: str, size: tuple[int, int], cameras: int, topics: str
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "camchain.yaml"
         file.write_text(kalibr_text(rig), encoding="utf-8")
+        if cameras == 1 and Path(source).is_dir():
+            # Images of one camera alone are a recording only by the calibration beside them.
+            source = f"mono:{source}"
         return open_dataset(source, DatasetSettings(calibration=file, topics=topics))
 
 

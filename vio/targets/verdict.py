@@ -49,6 +49,7 @@ _STEP_SIGMAS = 0.1  # of numerical differences
 _MEDIAN_LENGTH = 1.1774  # of a vector of two Gaussian components of unit variance
 _CHANCE = 0.99  # of halves that agree as stated; further apart, they inflate the sigmas
 _UNSYNCHRONISED = 1.5  # residual of the pair over that of the cameras alone
+_UNEQUAL = 2.0  # residual of one camera over the other's, each adjusted alone
 MIN_TILT_DEG = 15.0
 CELLS = 3  # along each side of the image, which must hold corners
 _MIN_CELL_SHARE = 0.01  # of all corners, in a cell of the image
@@ -319,13 +320,15 @@ def judge(found: Adjusted, seen: Sightings, alone_sigma_px: Sequence[float]) -> 
     inflation = _inflation(halves)
     findings = [
         *_unsynchronised(found, alone_sigma_px),
+        *_unequal(alone_sigma_px),
         *coverage_findings(seen, cameras),
         *tilt_findings(found.at),
     ]
     if inflation > 1:
         findings.append(
             f"halves of the views disagree {inflation:.1f} times more than the residuals explain "
-            "(a lens that the model does not hold, a board that bends, or blurred corners): "
+            "(a lens that the model does not hold, a board that bends, blurred corners, or a "
+            "rolling shutter in motion): "
             "standard deviations are multiplied by that"
         )
     grid = tuple(pixel_grid(camera) for camera in cameras)
@@ -353,6 +356,18 @@ def _unsynchronised(found: Adjusted, alone_sigma_px: Sequence[float]) -> list[st
         f"corners fit each camera alone {worst:.1f} times better than the pair: left and right "
         "images were not exposed at the same moment, or the cameras moved against each other; "
         "record with a hardware trigger, or hold the board still for each pair"
+    ]
+
+
+def _unequal(alone_sigma_px: Sequence[float]) -> list[str]:
+    """Return whether one camera of a pair sees the corners much less accurately."""
+    worst = int(np.argmax(alone_sigma_px))
+    ratio = alone_sigma_px[worst] / min(alone_sigma_px)
+    if ratio < _UNEQUAL:
+        return []
+    return [
+        f"the {('left', 'right')[worst]} camera's corners are {ratio:.1f} times less accurate than "
+        "the other one's: focus it, clean its lens, or shorten its exposure"
     ]
 
 
