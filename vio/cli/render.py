@@ -204,17 +204,17 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
     if args.frame_times is not None and args.rate is not None:
         raise ConfigError("--frame-times and --rate exclude each other; give one of them")
     trajectory, frame_times, imu = _flight(args)
-    rig: Any = args.rig or (
-        "euroc" if isinstance(trajectory, Path) else "kitti" if car else "euroc-rectified"
-    )
+    rig: Any = args.rig or _usual_rig(trajectory, car=car)
     form = _form_of(args, rig, imu)
     if form == "kitti":
         imu = "none"
+    elif imu is None:
+        imu = "simulated"
     scenario = Scenario(
         scene=args.scene,
         trajectory=trajectory,
         frame_times=frame_times,
-        imu=imu if imu in ("simulated", "none") else "simulated" if imu is None else Path(imu),
+        imu=imu if imu in ("simulated", "none") else Path(imu),
         velocity=args.velocity or ("paper" if form == "kitti" else "none"),
         rig=rig,
         width=args.width,
@@ -224,6 +224,13 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
         seed=args.seed,
     )
     return scenario, form
+
+
+def _usual_rig(trajectory: object, *, car: bool) -> str:
+    """Return the rig that goes with a flight of a file, with a car, or with a simulated flight."""
+    if isinstance(trajectory, Path):
+        return "euroc"
+    return "kitti" if car else "euroc-rectified"
 
 
 def _flight(args: argparse.Namespace) -> tuple[Any, Any, Any]:

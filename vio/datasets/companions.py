@@ -49,17 +49,9 @@ _SHARED_FOLDERS = ("calibration", "extras")  # of 4Seasons and Monado
 
 def calibration_beside(layout: Layout) -> Path | None:
     """Return the calibration file of a recording; None: there is none."""
-    above = [layout.root.parent] if layout.root.name == "mav0" else []
-    folders = [
-        base / inside
-        for base in dict.fromkeys((layout.root, layout.base, *above))
-        for inside in _CALIBRATION_FOLDERS
-    ]
-    # beside the recordings of one rig
-    folders += [layout.root.absolute().parent / name for name in _SHARED_FOLDERS]
     if is_pair_of_eth3d(layout):
         return layout.root / EXTRINSICS
-    for folder in folders:
+    for folder in _folders_of_calibrations(layout):
         if not folder.is_dir():
             continue
         if "undistorted" in str(layout.left) and (folder / STEREO).is_file():
@@ -67,6 +59,15 @@ def calibration_beside(layout: Layout) -> Path | None:
         if (found := rigs.find_calibration(folder)) is not None:
             return found
     return None
+
+
+def _folders_of_calibrations(layout: Layout) -> list[Path]:
+    """Return where a recording's calibration may lie: in it, above it, or beside all of its rig."""
+    above = [layout.root.parent] if layout.root.name == "mav0" else []
+    own = dict.fromkeys((layout.root, layout.base, *above))
+    folders = [base / inside for base in own for inside in _CALIBRATION_FOLDERS]
+    shared = layout.root.absolute().parent
+    return [*folders, *(shared / name for name in _SHARED_FOLDERS)]
 
 
 def find_calibration_of(layout: Layout) -> Path:
@@ -223,10 +224,7 @@ def _read_motion(
     """Read the IMU and the velocities, on the clock of the images; return the samples, their
     files and notes.
     """
-    imu = next(
-        (f for base in (layout.root, layout.base) for n in IMU_FILES if (f := base / n).is_file()),
-        None,
-    )
+    imu = _imu_file(layout)
     velocity = layout.root / "velocity.csv"
     files = [f for f in (imu, velocity) if f is not None and f.is_file()]
     if not files:
@@ -254,6 +252,12 @@ def _read_motion(
         check_overlap(times_ns, speeds.times_ns, velocity)
         parts.append(speeds)
     return in_time_order(*parts), files, notes
+
+
+def _imu_file(layout: Layout) -> Path | None:
+    """Return the table of the IMU; None: there is none."""
+    named = (base / name for base in (layout.root, layout.base) for name in IMU_FILES)
+    return next((file for file in named if file.is_file()), None)
 
 
 def _read_reference(

@@ -144,15 +144,17 @@ def _find_images(
     by_name = set(there.names)
     by_stem = {stem_of(name): name for name in there.names}
     found = [name if name in by_name else by_stem.get(Path(name).stem) for name in names]
-    missing = [k for k, file in enumerate(found) if file is None]
-    if missing and (missing[0] == 0 or len(missing) < len(names) - missing[0]):
+    present = tuple(file for file in found if file is not None)
+    missing = len(found) - len(present)
+    if missing and (not present or found[: len(present)] != list(present)):
+        first = found.index(None)
         raise DataError(
-            f"{path}, line {lines[missing[0]]}: {there.folder / names[missing[0]]} is missing "
-            f"({len(missing)} of "
+            f"{path}, line {lines[first]}: {there.folder / names[first]} is missing "
+            f"({missing} of "
             f"{len(names)} listed images are); copy it again, or remove such lines"
         )
-    files = ImageFiles(there.folder, tuple(file for file in found if file is not None))
-    return files, sum(file != name for file, name in zip(files.names, names, strict=False))
+    others = sum(file != name for file, name in zip(present, names, strict=False))
+    return ImageFiles(there.folder, present), others
 
 
 def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray, tuple[str, ...]]:

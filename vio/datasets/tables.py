@@ -134,22 +134,18 @@ def table_rows(
     Raises:
         DataError: the file cannot be read or is empty, or a line has another number of columns.
     """
-    header = list[str]()
-    unread = ""
+    above = _LinesAbove(columns, [] if comments is None else comments)
     is_data = False
     lines = lines_of(path)
     for number, line in lines:
         text = line.strip()
-        fields = split_cells(text.lstrip("#"))
-        if not text or text.startswith("#") or (not is_data and not _NUMBER.fullmatch(fields[0])):
-            if header and text and not text.startswith("#"):
-                unread = f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a point)"
-            if not is_data and text:
-                cells = header_cells(text, columns)
-                if cells:
-                    header = _with_units(header, cells)
-                elif comments is not None:
-                    comments.append(text)
+        if not text or text.startswith("#"):
+            if not is_data:
+                above.take(number, text)
+            continue
+        fields = split_cells(text)
+        if not is_data and not _NUMBER.fullmatch(next(iter(fields), "")):
+            above.take(number, text)
             continue
         if len(fields) != columns:
             if cut is not None and is_data and len(fields) < columns and next(lines, None) is None:
@@ -161,12 +157,34 @@ def table_rows(
             )
         if not is_data:
             is_data = True
-            yield 0, header
+            yield 0, above.header
         yield number, fields
     if not is_data:
         raise DataError(
-            f"{path}: holds no line of data ({form}){unread}; copy it again, or remove it"
+            f"{path}: holds no line of data ({form}){above.unread}; copy it again, or remove it"
         )
+
+
+class _LinesAbove:
+    """The lines above the data of a table: its header, and comments."""
+
+    def __init__(self, columns: int, comments: list[str]) -> None:
+        self.header = list[str]()
+        self.unread = ""  # of a line of text below the header: why it is no data
+        self._columns = columns
+        self._comments = comments
+
+    def take(self, number: int, text: str) -> None:
+        """Take a line, which may be empty."""
+        if not text:
+            return
+        if self.header and not text.startswith("#"):
+            self.unread = f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a point)"
+        cells = header_cells(text, self._columns)
+        if cells:
+            self.header = _with_units(self.header, cells)
+        else:
+            self._comments.append(text)
 
 
 def _with_units(header: list[str], cells: list[str]) -> list[str]:
@@ -342,14 +360,13 @@ def _factor(
         factor = factor_in_words(table.comments, units)
     if factor is None:
         unknown = [word for cell in cells if (word := unknown_unit(cell, units)) is not None]
-        note = (
-            f"{table.path}: doubtful: the unit {unknown[0]!r} of the {name} is not known; it is read "
+        notes = [
+            f"{table.path}: doubtful: the unit {word!r} of the {name} is not known; it is read "
             f"as {si}; if it is another, all its readings are off by a factor: write it as "
             f"{' or '.join(list(units)[:1])}, {_OTHER_UNITS[si]}"
-            if unknown
-            else ""
-        )
-        return 1.0, [note] if note else []
+            for word in unknown[:1]
+        ]
+        return 1.0, notes
     if factor == 1.0:
         return 1.0, []
     note = f"{table.path}: the header states {_words(factor)}; the {name} is converted to {si}"
@@ -369,9 +386,7 @@ def _imu_order(table: NumberTable) -> Sequence[int] | None:
     """
     found: dict[tuple[str, str], list[int]] = {}
     for k, cell in enumerate(table.header[1:]):
-        letters = re.sub(r"[^a-z]", "", without_unit(cell)).replace("axis", "")
-        axis = next((c for c in reversed(letters) if c in "xyz"), "")
-        found.setdefault((_sensor(letters), axis), []).append(k)
+        found.setdefault(_sensor_and_axis(cell), []).append(k)
     if not any(kind and axis for kind, axis in found):
         return None
     wanted = [(kind, axis) for kind in "wa" for axis in "xyz"]
@@ -385,6 +400,13 @@ def _imu_order(table: NumberTable) -> Sequence[int] | None:
             "'timestamp [ns],wx,wy,wz,ax,ay,az', or no header for that order"
         )
     return [found[key][0] for key in wanted]
+
+
+def _sensor_and_axis(cell: str) -> tuple[str, str]:
+    """Return the sensor and the axis that a cell of a header names; empty where it names none."""
+    letters = re.sub(r"[^a-z]", "", without_unit(cell)).replace("axis", "")
+    axis = next((c for c in reversed(letters) if c in "xyz"), "")
+    return _sensor(letters), axis
 
 
 def _sensor(letters: str) -> str:

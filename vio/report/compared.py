@@ -56,20 +56,27 @@ def compared_figures(runs: Sequence[FinishedRun]) -> dict[str, list[tuple[str, b
     """
     columns = [run_figures(run) for run in runs]
     rows = {name: [(column[name], False) for column in columns] for name in columns[0]}
-    if len(runs) < 2 or len({str(run.metrics.get("source")) for run in runs}) > 1:
-        return rows
-    numbers = [smaller_is_better(run) for run in runs]
-    for name in numbers[0]:
-        values = [column[name] for column in numbers]
-        known = [value for value in values if value is not None]
-        if len(known) < 2:
-            continue
-        best = min(known)
-        rows[name] = [
-            (text + _change(values[0], value), value == best != max(known))
-            for (text, _), value in zip(rows[name], values, strict=True)
-        ]
+    sources = {str(run.metrics.get("source")) for run in runs}
+    if len(runs) > 1 and len(sources) == 1:
+        numbers = [smaller_is_better(run) for run in runs]
+        for name in numbers[0]:
+            values = [column[name] for column in numbers]
+            rows[name] = _with_changes([column[name] for column in columns], values)
     return rows
+
+
+def _with_changes(texts: Sequence[str], values: Sequence[float | None]) -> list[tuple[str, bool]]:
+    """Return the texts of one figure with the changes from the first value, and which is the
+    smallest; where less than two are known, neither.
+    """
+    known = [value for value in values if value is not None]
+    if len(known) < 2:
+        return [(text, False) for text in texts]
+    best = min(known)
+    return [
+        (text + _change(values[0], value), value == best != max(known))
+        for text, value in zip(texts, values, strict=True)
+    ]
 
 
 def _change(first: float | None, value: float | None) -> str:

@@ -79,6 +79,14 @@ def add_frames_of_tf(bag: Bag, index: BagIndex, roles: Roles, infos: Sequence[st
     """
     if _add_sdk_frames(bag, index, roles) or _connected(index, roles, infos):
         return
+    fixed = {key: T for key, T in _fixed_frames(bag).items() if key not in index.frames}
+    index.frames.update(fixed)
+    if fixed and _connected(index, roles, infos):
+        index.frames_from = "/tf, where it does not change"
+
+
+def _fixed_frames(bag: Bag) -> dict[tuple[str, str], FloatArray]:
+    """Return the transforms (4, 4) on /tf that never change, by parent and child."""
     topics = [t.name for t in bag.topics if t.kind == TF and not t.name.endswith("tf_static")]
     first: dict[tuple[str, str], FloatArray] = {}
     moving: set[tuple[str, str]] = set()
@@ -88,10 +96,7 @@ def add_frames_of_tf(bag: Bag, index: BagIndex, roles: Roles, infos: Sequence[st
             T = transform_of(item.transform)
             if np.abs(T - first.setdefault(key, T)).max() > _SAME:
                 moving.add(key)
-    still = {key: T for key, T in first.items() if key not in moving and key not in index.frames}
-    index.frames.update(still)
-    if still and _connected(index, roles, infos):
-        index.frames_from = "/tf, where it does not change"
+    return {key: T for key, T in first.items() if key not in moving}
 
 
 def _connected(index: BagIndex, roles: Roles, infos: Sequence[str | None]) -> bool:
@@ -128,11 +133,7 @@ def _add_sdk_frames(bag: Bag, index: BagIndex, roles: Roles) -> bool:
 
 def _sdk_transforms(bag: Bag, sensors: Sequence[Topic]) -> dict[str, FloatArray]:
     """Return the transform of each sensor's stream, in the first group that the left camera has."""
-    known = [t.name for t in bag.topics if t.kind == TRANSFORM and t.count]
-    first: dict[str, FloatArray] = {}
-    for message in bag.messages(known):
-        if message.topic not in first:
-            first[message.topic] = transform_of(bag.decoded(message))
+    first = _first_transforms(bag)
     found: dict[str, FloatArray] = {}
     group = None
     for sensor in sensors:
@@ -144,3 +145,13 @@ def _sdk_transforms(bag: Bag, sensors: Sequence[Topic]) -> dict[str, FloatArray]
         if group in named:
             found[sensor.name] = first[named[group]]
     return found
+
+
+def _first_transforms(bag: Bag) -> dict[str, FloatArray]:
+    """Return the first transform (4, 4) of each topic of transforms."""
+    known = [t.name for t in bag.topics if t.kind == TRANSFORM and t.count]
+    first: dict[str, FloatArray] = {}
+    for message in bag.messages(known):
+        if message.topic not in first:
+            first[message.topic] = transform_of(bag.decoded(message))
+    return first

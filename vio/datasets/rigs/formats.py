@@ -192,9 +192,9 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
         return read_four_seasons(path, image_size)
     if path.name == eth3d.EXTRINSICS:
         return eth3d.read_eth3d(path, image_size)
-    if suffix == ".txt" and bare.is_bare(path):
-        return bare.read_bare(path, image_size)
     if suffix == ".txt":
+        if bare.is_bare(path):
+            return bare.read_bare(path, image_size)
         return kitti_rig(path, image_size)[0]
     if suffix == ".xml" and is_boofcv(path):
         return read_boofcv(path)
