@@ -151,41 +151,40 @@ def parts_of(
     return recording, beside.motion, sizes, settings, rectifier
 
 
+@dataclass(frozen=True, slots=True)
+class ReadImages:
+    """What was read of the images of a recording, before what lies beside them."""
+
+    kind: str  # of the recording
+    layout: Layout  # where its parts lie
+    calibration: tuple[Path, Rig]  # the file, and its rig
+    times: tuple[IntArray, Path | None]  # of the frames (F,), and their file; None: assumed
+    notes: Sequence[str]  # about images and times
+    used: Sequence[Path]  # further files and folders that were read, or are known not to matter
+    has_depths: bool = False  # whether one camera has depth images
+
+
 def read_companions(
-    kind: str,
-    layout: Layout,
-    calibration: tuple[Path, Rig],
-    settings: DatasetSettings,
-    times: tuple[IntArray, Path | None],
-    notes: Sequence[str],
-    used: Sequence[Path],
-    *,
-    reference: Trajectory | None = None,
-    has_depths: bool = False,
+    images: ReadImages, settings: DatasetSettings, reference: Trajectory | None = None
 ) -> Parts:
     """Read what lies beside images: the pose of the IMU, its samples, velocities and ground truth.
 
     Args:
-        kind: of the recording.
-        layout: where its parts lie.
-        calibration: the file and its rig.
+        images: what was read of the images.
         settings: reader settings.
-        times: of the frames (F,), and the file that they are from; None: assumed.
-        notes: about images and times.
-        used: further files and folders that were read, or are known not to matter.
         reference: ground truth that was read already.
-        has_depths: whether one camera has depth images.
 
     Raises:
         DataError: samples or ground truth cannot be used.
         CalibrationError: the rig cannot be rectified, or samples need the pose of their sensor.
     """
-    (file, rig) = calibration
-    (times_ns, times_file) = times
+    layout = images.layout
+    (file, rig) = images.calibration
+    (times_ns, times_file) = images.times
     rig, extrinsics = _with_extrinsics(rig, layout, file)
     motion, motion_files, motion_notes = _read_motion(layout, rig, times_ns, times_file is not None)
     with naming(file):
-        depth_noise = settings.depth_noise if has_depths else None
+        depth_noise = settings.depth_noise if images.has_depths else None
         rectifier = rig.rectifier(
             settings.interpolation, settings.projection, depth_noise=depth_noise
         )
@@ -197,12 +196,12 @@ def read_companions(
         motion,
         motion_notes,
         reference,
-        [*read, *extrinsics, *motion_files, *used],
-        (*notes, *rig.notes),
+        [*read, *extrinsics, *motion_files, *images.used],
+        (*images.notes, *rig.notes),
         [file] * len(rig.cameras),
     )
     has_body = rig.T_cam0_imu is not None and (rig.cam1 is not None or len(motion_files) > 0)
-    return parts_of(kind, layout, rectifier, settings, times_ns, beside, has_body=has_body)
+    return parts_of(images.kind, layout, rectifier, settings, times_ns, beside, has_body=has_body)
 
 
 def _with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Path]]:

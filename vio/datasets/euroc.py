@@ -86,11 +86,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
     levels, depth_notes = gray_levels(pairs)
     candidates = (mav / STATE_CSV, mav.absolute().parent / TUM_FILE)
     truth = next((file for file in candidates if file.is_file()), None)
-    read = [
-        mav / name / file
-        for name in ("cam0", "cam1", "imu0")
-        for file in ("sensor.yaml", "data.csv")
-    ]
+    folders = [mav / name for name in ("cam0", "cam1", "imu0")]
+    read = [folder / file for folder in folders for file in ("sensor.yaml", "data.csv")]
     layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
     reference = None if truth is None else _read_reference(truth, T_body_imu, rig.T_imu_cam0)
     beside = Beside(
@@ -99,7 +96,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
         reference,
         read if truth is None else [*read, truth],
         (*notes, *depth_notes),
-        [mav / name / "sensor.yaml" for name in ("cam0", "cam1")],
+        [mav / "cam0" / "sensor.yaml", mav / "cam1" / "sensor.yaml"],
     )
     parts = parts_of("euroc", layout, rectifier, settings, times_ns, beside)
     return ImageDataset(*parts, pairs, imu_noise=noise, levels=levels)

@@ -5,6 +5,7 @@ ms, us or ns.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import re
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -136,19 +137,15 @@ def table_rows(
     """
     above = _LinesAbove(columns, [] if comments is None else comments)
     is_data = False
-    lines = lines_of(path)
-    for number, line in lines:
-        text = line.strip()
+    lines = ((number, line.strip()) for number, line in lines_of(path))
+    for number, text in lines:
+        if not is_data and above.take(number, text):
+            continue
         if not text or text.startswith("#"):
-            if not is_data:
-                above.take(number, text)
             continue
         fields = split_cells(text)
-        if not is_data and not _NUMBER.fullmatch(next(iter(fields), "")):
-            above.take(number, text)
-            continue
         if len(fields) != columns:
-            if cut is not None and is_data and len(fields) < columns and next(lines, None) is None:
+            if cut is not None and is_data and _is_cut(fields, columns, lines):
                 early = f"the last line ends too early ({len(fields)} of {columns} values)"
                 cut.append(f"{path}, line {number}: {early}; left out")
                 return
@@ -165,6 +162,11 @@ def table_rows(
         )
 
 
+def _is_cut(fields: Sequence[str], columns: int, further: Iterator[object]) -> bool:
+    """Tell whether a line is too short and no further one follows, which is taken."""
+    return len(fields) < columns and next(further, None) is None
+
+
 class _LinesAbove:
     """The lines above the data of a table: its header, and comments."""
 
@@ -174,17 +176,21 @@ class _LinesAbove:
         self._columns = columns
         self._comments = comments
 
-    def take(self, number: int, text: str) -> None:
-        """Take a line, which may be empty."""
+    def take(self, number: int, text: str) -> bool:
+        """Take a line, unless it is one of data; return whether it was taken."""
         if not text:
-            return
-        if self.header and not text.startswith("#"):
+            return True
+        is_comment = text.startswith("#")
+        if not is_comment and _NUMBER.fullmatch(next(iter(split_cells(text)), "")):
+            return False
+        if self.header and not is_comment:
             self.unread = f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a point)"
         cells = header_cells(text, self._columns)
         if cells:
             self.header = _with_units(self.header, cells)
         else:
             self._comments.append(text)
+        return True
 
 
 def _with_units(header: list[str], cells: list[str]) -> list[str]:
@@ -359,14 +365,15 @@ def _factor(
     if factor is None:
         factor = factor_in_words(table.comments, units)
     if factor is None:
-        unknown = [word for cell in cells if (word := unknown_unit(cell, units)) is not None]
-        notes = [
+        word = next(filter(None, (unknown_unit(cell, units) for cell in cells)), None)
+        if word is None:
+            return 1.0, []
+        note = (
             f"{table.path}: doubtful: the unit {word!r} of the {name} is not known; it is read "
             f"as {si}; if it is another, all its readings are off by a factor: write it as "
             f"{' or '.join(list(units)[:1])}, {_OTHER_UNITS[si]}"
-            for word in unknown[:1]
-        ]
-        return 1.0, notes
+        )
+        return 1.0, [note]
     if factor == 1.0:
         return 1.0, []
     note = f"{table.path}: the header states {_words(factor)}; the {name} is converted to {si}"
@@ -389,11 +396,10 @@ def _imu_order(table: NumberTable) -> Sequence[int] | None:
         found.setdefault(_sensor_and_axis(cell), []).append(k)
     if not any(kind and axis for kind, axis in found):
         return None
-    wanted = [(kind, axis) for kind in "wa" for axis in "xyz"]
-    others = set(found) - set(wanted)
-    may_have_others = len(table.header) > _IMU_COLUMNS
-    missing = any(len(found.get(key, ())) != 1 for key in wanted)
-    if missing or (others and not may_have_others):
+    wanted = list(itertools.product("wa", "xyz"))
+    counts = [len(found.get(key, ())) for key in wanted]
+    others = found.keys() - wanted if len(table.header) <= _IMU_COLUMNS else set()
+    if others or counts != [1] * len(wanted):
         raise DataError(
             f"{table.path}: the header {','.join(table.header)[:80]!r} does not name gyro and "
             "accel; write "

@@ -68,8 +68,13 @@ def _not_read(layout: Layout, kept: set[Path]) -> list[str]:
         for child in sorted(folder.iterdir()):
             expected = child.absolute() in kept or _is_silent(child, with_images=folder in images)
             if not expected:
-                found.append(str(child.relative_to(layout.root)) + ("/" if child.is_dir() else ""))
+                found.append(_name_in(layout.root, child))
     return found
+
+
+def _name_in(root: Path, child: Path) -> str:
+    """Return the path of a file, or of a folder with a slash behind, within a recording."""
+    return f"{child.relative_to(root)}{'/' if child.is_dir() else ''}"
 
 
 def _is_silent(child: Path, *, with_images: bool) -> bool:

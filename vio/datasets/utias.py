@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -79,16 +79,22 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
 
 def _read_mat(path: Path) -> Mapping[str, FloatArray]:
     shapes, raw = _arrays_of_mat(path)
-    if missing := [key for key in KEYS if key not in shapes]:
-        names = " ".join(sorted(name for name in shapes if not name.startswith("__")))
-        raise DataError(
-            f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found {names}"
-        )
+    _check_names(shapes, path)
     wanted = [name for name in (*KEYS, *OPTIONAL_KEYS) if name in shapes]
     for key in wanted:
         if not isinstance(raw.get(key), np.ndarray) or raw[key].dtype.kind not in "fiu":
             raise DataError(f"{path}: {key} is not an array of real numbers; save it again as one")
     return {key: raw[key].astype(np.float64) for key in wanted}
+
+
+def _check_names(names: Iterable[str], path: Path) -> None:
+    """Raise DataError where a variable is missing among those of a file."""
+    held = sorted(name for name in names if not name.startswith("__"))
+    if missing := [key for key in KEYS if key not in held]:
+        raise DataError(
+            f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found "
+            f"{' '.join(held)}"
+        )
 
 
 def _arrays_of_mat(path: Path) -> tuple[dict[str, tuple[int, ...]], Mapping[str, Any]]:

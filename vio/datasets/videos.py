@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from vio.cameras.rig import Rig
-from vio.datasets.companions import find_calibration_of, read_companions
+from vio.datasets.companions import ReadImages, find_calibration_of, read_companions
 from vio.datasets.image_pairs import ImageRecording, half_of
 from vio.datasets.image_times import times_of
 from vio.datasets.images import prefetch
@@ -102,9 +102,8 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
             f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the "
             "shorter counts"
         )
-    parts = read_companions(
-        "video", layout, (file, rig), settings, (times_ns, times_file), notes, files
-    )
+    read = ReadImages("video", layout, (file, rig), (times_ns, times_file), notes, files)
+    parts = read_companions(read, settings)
     return VideoDataset(*parts, files, imu_noise=rig.imu_noise)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from vio.geometry.lie import FloatArray, se3_from_parts
 from vio.report.words import run_figures, smaller_is_better
 from vio.runs.finished import FinishedRun
 
+_Value = TypeVar("_Value")
 _MIN_FRAMES = 3  # in common, for an alignment
 
 
@@ -55,14 +57,18 @@ def compared_figures(runs: Sequence[FinishedRun]) -> dict[str, list[tuple[str, b
     Figures of different recordings are not compared.
     """
     columns = [run_figures(run) for run in runs]
-    rows = {name: [(column[name], False) for column in columns] for name in columns[0]}
+    rows = {name: [(text, False) for text in _cells(columns, name)] for name in columns[0]}
     sources = {str(run.metrics.get("source")) for run in runs}
     if len(runs) > 1 and len(sources) == 1:
         numbers = [smaller_is_better(run) for run in runs]
         for name in numbers[0]:
-            values = [column[name] for column in numbers]
-            rows[name] = _with_changes([column[name] for column in columns], values)
+            rows[name] = _with_changes(_cells(columns, name), _cells(numbers, name))
     return rows
+
+
+def _cells(columns: Sequence[Mapping[str, _Value]], name: str) -> list[_Value]:
+    """Return a row of a table that is given by columns."""
+    return [column[name] for column in columns]
 
 
 def _with_changes(texts: Sequence[str], values: Sequence[float | None]) -> list[tuple[str, bool]]:

@@ -103,12 +103,16 @@ def _key_figures(runs: Sequence[FinishedRun]) -> str:
     if len(runs) == 1:
         return table("Figures", names, rows)
     best = _best_cells(found)
-    between = [apart(runs[0], run) for run in runs[1:]]
-    if any(between):
-        distances = ["–" if other is None else str(other) or "–" for other in between]
-        rows[f"distance from {runs[0].name}"] = ["–", *distances]
+    distances = _distances(runs)
+    if any(distances):
+        rows[f"distance from {runs[0].name}"] = ["–", *(text or "–" for text in distances)]
     remark = f"In brackets the change from {runs[0].name}; bold: the best." if best else ""
     return table("Figures", names, rows, best, remark)
+
+
+def _distances(runs: Sequence[FinishedRun]) -> list[str]:
+    """Return how far each other run is from the first, as text; empty: they are not comparable."""
+    return [str(apart(runs[0], run) or "") for run in runs[1:]]
 
 
 def _best_cells(figures: Mapping[str, Sequence[tuple[str, bool]]]) -> set[tuple[str, int]]:

@@ -58,20 +58,21 @@ def play(
         should_stop: asked before each message.
     """
     recording = dataset.recording
-    T_cam0_imu = recording.T_cam0_imu
-    imu = topics.imu if T_cam0_imu is not None and "imu" in recording.motion else None
+    imu = _topic_of_imu(recording, topics)
     cameras = topics.cameras if recording.camera.kind == "stereo" else topics.cameras[:1]
-    kinds = dict.fromkeys(cameras, IMAGE) | {info_topic(name): CAMERA_INFO for name in cameras}
+    sensors = dict.fromkeys(cameras, IMAGE)
     if imu is not None:
-        kinds[imu] = IMU
-    out = publisher(transport, kinds, default=how.quality)
-    if imu is not None and T_cam0_imu is not None:
+        sensors[imu] = IMU
+    infos = {info_topic(name): CAMERA_INFO for name in cameras}
+    out = publisher(transport, sensors | infos, default=how.quality)
+    if imu is not None:
         first_ns = int(recording.frame_times_ns[0])
-        out.static_transforms(first_ns, [(IMU_FRAME, CAMERA_FRAMES[0], se3_inverse(T_cam0_imu))])
+        out.static_transforms(
+            first_ns, [(IMU_FRAME, CAMERA_FRAMES[0], se3_inverse(recording.T_cam0_body))]
+        )
     if how.wait:
-        sensors = [name for name, kind in kinds.items() if kind != CAMERA_INFO]
         _wait_for_subscribers(
-            transport, sensors, lambda: _publish_infos(out, cameras, recording), should_stop
+            transport, list(sensors), lambda: _publish_infos(out, cameras, recording), should_stop
         )
     frames = samples = 0
     for event in itertools.takewhile(
@@ -84,6 +85,12 @@ def play(
             samples += 1
             out.imu(imu, IMU_FRAME, event)
     return Played(frames, samples)
+
+
+def _topic_of_imu(recording: Recording, topics: SensorTopics) -> str | None:
+    """Return the topic of the samples; None: the recording has none, or not their pose."""
+    has_imu = recording.T_cam0_imu is not None and "imu" in recording.motion
+    return topics.imu if has_imu else None
 
 
 def _wait_for_subscribers(

@@ -17,7 +17,7 @@ from vio.datasets.bags.topics import Roles, choose
 from vio.datasets.companions import check_overlap, imu_on_camera_clock
 from vio.datasets.images import UnreadableImageError, decode_gray
 from vio.datasets.rigs import find_calibration, load_rig
-from vio.datasets.rigs.camera_info import rig_from_camera_infos
+from vio.datasets.rigs.camera_info import CameraInfo, rig_from_camera_infos
 from vio.datasets.samples import MotionSamples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
@@ -138,9 +138,8 @@ def _rig(found: Contents, file: Path | None) -> Rig:
     infos = found.infos
     if file is not None:
         return load_rig(file, image_size=found.size, cameras=1 if len(topics) == 1 else 2)
-    stated = [
-        found.index.infos[name] for name in infos if name is not None and name in found.index.infos
-    ]
+    known = found.index.infos
+    stated = [known[name] for name in infos if name is not None and name in known]
     if len(stated) != len(topics):
         raise CalibrationError(
             f"{found.path}: no CameraInfo could be read; give --calibration FILE"
@@ -152,9 +151,14 @@ def _rig(found: Contents, file: Path | None) -> Rig:
         T_right_left = _stereo_pose_of_frames(found.index)
         if T_right_left is not None:
             source = found.index.frames_from
-            images = [info.of_images(found.size) for info in stated]
+            images = _of_images(stated, found.size)
             return rig_with_baseline(images, T_right_left, source, rectified=rectified)
     return rig_from_camera_infos(stated, rectified=rectified, image_size=found.size)
+
+
+def _of_images(infos: Sequence[CameraInfo], size: Size | None) -> list[CameraInfo]:
+    """Return the calibrations of images of a size."""
+    return [info.of_images(size) for info in infos]
 
 
 def _stereo_pose_of_frames(index: BagIndex) -> FloatArray | None:

@@ -114,8 +114,7 @@ def _add_sdk_frames(bag: Bag, index: BagIndex, roles: Roles) -> bool:
     left = _SDK_STREAM.fullmatch(roles.left.name)
     if left is None:
         return False
-    sensors = [topic for topic in (*roles.cameras, roles.imu) if topic is not None]
-    transforms = _sdk_transforms(bag, sensors)
+    transforms = _sdk_transforms(bag, list(filter(None, (*roles.cameras, roles.imu))))
     if roles.left.name not in transforms:
         return False
     T_left = transforms[roles.left.name]
@@ -125,8 +124,7 @@ def _add_sdk_frames(bag: Bag, index: BagIndex, roles: Roles) -> bool:
     index.left.frame_id = roles.left.name
     index.right.frame_id = "" if roles.right is None else roles.right.name
     index.imu_frame = "" if roles.imu is None else roles.imu.name
-    for name, T in transforms.items():
-        index.frames[("realsense", name.lstrip("/"))] = T
+    index.frames |= {("realsense", name.lstrip("/")): T for name, T in transforms.items()}
     index.frames_from = "the transforms of RealSense's recorder"
     return True
 

@@ -304,8 +304,9 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
         takers.setdefault(name, []).append(taker)
     for name in infos:
         takers[name] = [partial(_info, index)]
-    for name in (t.name for t in bag.topics if t.kind == TF and t.name.endswith("tf_static")):
-        takers[name] = [lambda fields, message: index.add_frames(fields)]
+    for topic in bag.topics:
+        if topic.kind == TF and topic.name.endswith("tf_static"):
+            takers[topic.name] = [lambda fields, message: index.add_frames(fields)]
     for message in bag.messages(list(takers)):
         fields = bag.decoded(message)
         for taker in takers[message.topic]:

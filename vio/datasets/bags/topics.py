@@ -160,7 +160,7 @@ def _cameras(
 
     None in the place of the right one where there is one camera.
     """
-    images = [t for t in filled if t.kind in (IMAGE, COMPRESSED) and not _NO_GRAY.search(t.name)]
+    images = list(filter(_may_be_gray, filled))
     left_named = given.get("left")
     named = [t for t in (left_named,) if t is not None and t not in images]
     alone, others = _one_camera([*images, *named])
@@ -173,6 +173,10 @@ def _cameras(
         return alone, None
     _check_pair_possible(images, given, where)
     return _pair(images, given, where)
+
+
+def _may_be_gray(topic: Topic) -> bool:
+    return topic.kind in (IMAGE, COMPRESSED) and not _NO_GRAY.search(topic.name)
 
 
 def _check_pair_possible(
@@ -263,18 +267,19 @@ def _imu(
     accel_named = given.get("accel")
     if "imu" in given and not _lacks_accel(given):
         return named, accel_named
-    sensors = [t for t in filled if _may_be_imu(t)]
+    sensors = list(filter(_may_be_imu, filled))
     both: Sequence[Topic] = ()
-    gyros: Sequence[Topic] = ()
     if named is None:
         both = _of_sensor(sensors, "")
-        gyros = _of_sensor(sensors, "gyro")
-    else:
-        gyros = _of_sensor([named], "gyro")
+    gyros = _of_sensor(sensors if named is None else [named], "gyro")
     accels = _of_sensor(sensors, "accel") if accel_named is None else [accel_named]
     if gyros and accels and not both:
         return _joined_imu(gyros, accels, left, notes)
-    return _single([t for t in both or gyros if t.kind == IMU], left, notes), None
+    return _single(_of_kind(both or gyros, IMU), left, notes), None
+
+
+def _of_kind(topics: Sequence[Topic], kind: str) -> list[Topic]:
+    return [topic for topic in topics if topic.kind == kind]
 
 
 def _lacks_accel(given: Mapping[str, Topic | None]) -> bool:
