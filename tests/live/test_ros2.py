@@ -38,7 +38,7 @@ from vio.records import Estimate, ImuSample
 from vio.ros2.node import NodeSettings, run_node
 from vio.ros2.opening import open_transport
 from vio.ros2.outputs import FrameNames, Outputs
-from vio.ros2.play import play
+from vio.ros2.play import Playing, play
 from vio.ros2.sensors import Sensors, SensorTopics, Silence, check_types
 from vio.ros2.transport import Quality, publisher
 from vio.runs.finished import read_finished_run
@@ -157,9 +157,8 @@ def test_the_node_gives_the_poses_of_the_file_run(
         Member(graph),
         vio.open_dataset(flight),
         TOPICS,
-        rate=None,
-        quality="reliable",
-        should_stop=lambda: failures,
+        Playing(None, "reliable"),
+        lambda: failures,
     )
     assert played.frames == len(times)
     while len(taken["/vio/odometry"]) < len(times) and not failures:
@@ -364,7 +363,7 @@ def test_the_node_goes_on_after_a_reset_and_after_a_step_of_the_clock(
     )
     node.start()
     dataset = vio.open_dataset(flight)
-    play(player, dataset, TOPICS, rate=None, quality="reliable", should_stop=lambda: False, stop=8)
+    play(player, dataset, TOPICS, Playing(None, "reliable", stop=8), lambda: False)
 
     def received(count: int) -> list[tuple[int, FloatArray]]:
         deadline = time.monotonic() + 60
@@ -379,9 +378,7 @@ def test_the_node_goes_on_after_a_reset_and_after_a_step_of_the_clock(
     else:
         step_ns = 3600 * 10**9
     moved = Shifted(dataset, step_ns)
-    play(
-        player, moved, TOPICS, rate=None, quality="reliable", should_stop=lambda: False, wait=False
-    )
+    play(player, moved, TOPICS, Playing(None, "reliable", wait=False), lambda: False)
     poses = received(len(before) + 7)
     done.set()
     node.join()
@@ -822,9 +819,8 @@ def test_a_node_that_is_killed_leaves_a_folder_that_can_be_finished(
             player,
             Repeated(vio.open_dataset(flight), 200),
             TOPICS,
-            rate=1.0,
-            quality="reliable",
-            should_stop=(out / "unfinished" / "checkpoint").is_file,
+            Playing(1.0, "reliable"),
+            (out / "unfinished" / "checkpoint").is_file,
         )
         assert (out / "unfinished" / "checkpoint").is_file()
         time.sleep(1.0)

@@ -38,7 +38,7 @@ from vio.runs.live_folder import LiveRunSettings
 from vio.sources.oak import OakSource
 from vio.sources.realsense import RealSenseSource
 from vio.sources.recorder import Form, Recorder
-from vio.sources.run import run_source
+from vio.sources.run import LiveOptions, run_source
 from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame, open_source
 
 
@@ -125,12 +125,9 @@ def test_recordings_have_all_digits_and_ending_early_keeps_everything(
         source,
         Config(),
         None,
+        LiveOptions(LiveRunSettings(out, "camera"), kept, form, drop="none"),
         should_stop=lambda: source.given >= 12,
         say=lambda _: None,
-        record=kept,
-        record_as=form,
-        kept=LiveRunSettings(out, "camera"),
-        drop="none",
     )
     assert source.closed
     assert run.figures.dropped == 0
@@ -168,10 +165,9 @@ def test_a_camera_that_fails_leaves_the_trajectory_so_far(flight: Path, tmp_path
             Failing(flight),
             Config(),
             None,
+            LiveOptions(LiveRunSettings(tmp_path / "out", "camera"), drop="none"),
             should_stop=slow.should_stop,
             say=lambda _: None,
-            kept=LiveRunSettings(tmp_path / "out", "camera"),
-            drop="none",
             on_start=slow.start,
         )
     assert len(read_trajectory(tmp_path / "out" / "trajectory.tum")) >= 6

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -94,24 +94,12 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
     tasks = tasks_of(suite, place.data, digests, place.peers)
     digests.save()
     with locked_folder(place.out):
-        records: dict[str, Record] = {}
-        missing: dict[str, dict[str, Any]] = {}
-        # a long one that begins last keeps all others waiting
-        for task in sorted(tasks, key=lambda task: -task.size):
-            if task.failure is None and task.key not in records:
-                record = store.get(task.key)
-                if record is None:
-                    missing[task.key] = task.job
-                else:
-                    records[task.key] = _without_poses(record)
+        records, missing = _known_and_missing(tasks, store)
         reused = len(records)
         wrong = _wrong_references(missing)
         missing = {key: job for key, job in missing.items() if key not in wrong}
         tasks = [replace(task, failure=wrong.get(task.key, task.failure)) for task in tasks]
-        for sequence, why in {
-            task.sequence: task.failure for task in tasks if task.failure is not None
-        }.items():
-            log.warning("%s cannot be run: %s", sequence, why)
+        _warn_of_failures(tasks)
         progress(len(tasks) - len(missing), len(tasks))
         cache = str(place.cache.absolute())
         if place.scheduler is not None and missing:
@@ -124,6 +112,32 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
             records[key] = _without_poses(record)
             progress(len(tasks) - len(missing) + len(records) - reused, len(tasks))
         return _write(suite, place, tasks, records, store, reused)
+
+
+def _warn_of_failures(tasks: Iterable[Task]) -> None:
+    """Log once for each sequence why it cannot be run."""
+    failures = {task.sequence: task.failure for task in tasks if task.failure is not None}
+    for sequence, why in failures.items():
+        log.warning("%s cannot be run: %s", sequence, why)
+
+
+def _known_and_missing(
+    tasks: Iterable[Task], store: Store
+) -> tuple[dict[str, Record], dict[str, dict[str, Any]]]:
+    """Return the results that are there and the jobs of those that are not, by key.
+
+    The largest is first: a long one that begins last keeps all others waiting.
+    """
+    records: dict[str, Record] = {}
+    missing: dict[str, dict[str, Any]] = {}
+    for task in sorted(tasks, key=lambda task: -task.size):
+        if task.failure is None and task.key not in records:
+            record = store.get(task.key)
+            if record is None:
+                missing[task.key] = task.job
+            else:
+                records[task.key] = _without_poses(record)
+    return records, missing
 
 
 def read_bench(folder: Path) -> tuple[tuple[Outcome, ...], dict[str, Any]]:
@@ -166,6 +180,20 @@ def _wrong_references(jobs: Mapping[str, dict[str, Any]]) -> dict[str, str]:
 def _without_poses(record: Record) -> Record:
     """Return a record for tables alone: ten thousand trajectories would fill the memory."""
     return {name: value for name, value in record.items() if name != "trajectory"}
+
+
+def _write_trajectories(
+    folder: Path, tasks: Iterable[Task], records: Mapping[str, Record], store: Store
+) -> None:
+    """Write the poses of each run that has some, in TUM's form."""
+    folder.mkdir(exist_ok=True)
+    for task in tasks:
+        poses = (store.get(task.key) or {}).get("trajectory") if task.key in records else None
+        if poses is not None:
+            atomic_write_text(
+                folder / f"{task.sequence}.{task.system}.{task.seed}.tum",
+                "\n".join([*poses, ""]),
+            )
 
 
 def _write(
@@ -211,15 +239,7 @@ def _write(
     for name, text in texts.items():
         atomic_write_text(place.out / name, text)
     write_bench_report(place.out / "report.html", suite, rows, outcomes, facts)
-    trajectories = place.out / "trajectories"
-    trajectories.mkdir(exist_ok=True)
-    for task in tasks:
-        poses = (store.get(task.key) or {}).get("trajectory") if task.key in records else None
-        if poses is not None:
-            atomic_write_text(
-                trajectories / f"{task.sequence}.{task.system}.{task.seed}.tum",
-                "\n".join([*poses, ""]),
-            )
+    _write_trajectories(place.out / "trajectories", tasks, records, store)
     return Result(outcomes, reused, facts)
 
 

@@ -42,6 +42,7 @@ _MIN_CHANGE = 0.01  # a mean change below is none, however certain
 # recording at rest.
 _FLOOR = 1e-5
 
+_RunKey: TypeAlias = tuple[str, str, int]  # sequence, system, seed
 _Pair: TypeAlias = tuple[Outcome, Outcome]
 
 
@@ -97,25 +98,31 @@ class Comparison:
     only_in_one: int  # runs without a partner
     margin: float  # "not worse" is a change that is below this factor with 97.5 % confidence
 
+    def _has_worse(self) -> bool:
+        judged = [c.verdict for c in self.changes if c.is_judged]
+        return "worse" in judged or any(s.verdict == "worse" for s in self.sequences)
+
     @property
     def verdict(self) -> Verdict:
         """Worse where anything judged is; else as the ATE says, over all sequences and of single
         ones.
         """
-        verdicts = [c.verdict for c in self.changes if c.is_judged] + [
-            s.verdict for s in self.sequences
-        ]
-        if self.lost or "worse" in verdicts:
+        if self.lost or self._has_worse():
             return "worse"
-        primary = [c.verdict for c in self.changes if c.metric == _PRIMARY.name]
-        broken = any(s.verdict == "cannot tell" and s.after > s.before for s in self.sequences)
-        if broken or not primary or "cannot tell" in primary:
+        if any(s.verdict == "cannot tell" and s.after > s.before for s in self.sequences):
             return "cannot tell"
-        return "better" if "better" in primary else "not worse"
+        return _verdict_of([c.verdict for c in self.changes if c.metric == _PRIMARY.name])
 
     def as_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
         return {**asdict(self), "verdict": self.verdict}
+
+
+def _verdict_of(verdicts: Sequence[Verdict]) -> Verdict:
+    """Return the verdict of several systems' ATE, none of which is worse."""
+    if not verdicts or "cannot tell" in verdicts:
+        return "cannot tell"
+    return "better" if "better" in verdicts else "not worse"
 
 
 def compare(
@@ -160,21 +167,31 @@ def _sides(
     """Return the runs of two systems under one name; a trajectory of another system stands for
     all seeds.
     """
-    sides = []
-    for runs, system in zip((a, b), between, strict=True):
-        known = tuple(runs)
-        own = [replace(o, system=" to ".join(between)) for o in known if o.system == system]
-        if not own:
-            names = ", ".join(dict.fromkeys(o.system for o in known))
-            raise EvaluationError(f"--between {system}: there is no such system; choose of {names}")
-        sides.append(own)
-    seeds = sorted({o.seed for side in sides for o in side if o.seed is not None}) or [0]
-    spread = (
-        [replace(o, seed=s) for o in side for s in (seeds if o.seed is None else [o.seed])]
-        for side in sides
+    before = _runs_of(a, between[0], as_system=" to ".join(between))
+    after = _runs_of(b, between[1], as_system=" to ".join(between))
+    seeds = sorted({o.seed for o in before + after if o.seed is not None}) or [0]
+    return _spread(before, seeds), _spread(after, seeds)
+
+
+def _runs_of(outcomes: Iterable[Outcome], system: str, *, as_system: str) -> list[Outcome]:
+    """Return the runs of a system under another name.
+
+    Raises:
+        EvaluationError: there is none.
+    """
+    known = tuple(outcomes)
+    own = [replace(o, system=as_system) for o in known if o.system == system]
+    if not own:
+        names = ", ".join(dict.fromkeys(o.system for o in known))
+        raise EvaluationError(f"--between {system}: there is no such system; choose of {names}")
+    return own
+
+
+def _spread(outcomes: Iterable[Outcome], seeds: Sequence[int]) -> tuple[Outcome, ...]:
+    """Return the runs, with those that have no seed once for each seed."""
+    return tuple(
+        replace(o, seed=seed) for o in outcomes for seed in (seeds if o.seed is None else [o.seed])
     )
-    before, after = map(tuple, spread)
-    return before, after
 
 
 def compare_outcomes(
@@ -192,29 +209,42 @@ def compare_outcomes(
     Raises:
         EvaluationError: they have no run in common.
     """
-    before, after = (
-        {(o.sequence, o.system, o.seed): o for o in runs if o.seed is not None} for runs in (a, b)
-    )
-    common = [key for key in before if key in after]
-    if not common:
-        raise EvaluationError(
-            f"{what} have no run of the same sequence, configuration and seed; compare one suite"
-        )
-    pairs = [(before[key], after[key]) for key in common]
+    before = _by_run(a)
+    after = _by_run(b)
+    pairs = _pairs_of(before, after, what)
     systems = list(dict.fromkeys(old.system for old, _ in pairs))
-    changes = [
-        change
-        for names in ((_PRIMARY.name,), _JUDGED[1:], _NOT_JUDGED)
-        for change in _tested(pairs, systems, names, drawn_each_seed, margin)
-    ]
+    changes = list[Change]()
+    for names in ((_PRIMARY.name,), _JUDGED[1:], _NOT_JUDGED):
+        changes += _tested(pairs, systems, names, drawn_each_seed, margin)
     return Comparison(
         tuple(sorted(changes, key=lambda c: systems.index(c.system))),
         tuple(_sequence_changes(pairs, systems, factor)),
         tuple((o.sequence, o.system, n.failure or "") for o, n in pairs if _fails_first(n, o)),
         tuple((o.sequence, o.system) for o, n in pairs if _fails_first(o, n)),
-        len(before) + len(after) - 2 * len(common),
+        len(before) + len(after) - 2 * len(pairs),
         margin,
     )
+
+
+def _by_run(outcomes: Iterable[Outcome]) -> dict[_RunKey, Outcome]:
+    """Return the runs, not the trajectories of others, by sequence, system and seed."""
+    return {(o.sequence, o.system, o.seed): o for o in outcomes if o.seed is not None}
+
+
+def _pairs_of(
+    before: Mapping[_RunKey, Outcome], after: Mapping[_RunKey, Outcome], what: str
+) -> list[_Pair]:
+    """Return the runs that both have.
+
+    Raises:
+        EvaluationError: there is none.
+    """
+    pairs = [(old, after[key]) for key, old in before.items() if key in after]
+    if not pairs:
+        raise EvaluationError(
+            f"{what} have no run of the same sequence, configuration and seed; compare one suite"
+        )
+    return pairs
 
 
 def _tested(
@@ -318,22 +348,32 @@ def _sequence_changes(
     """Yield sequences whose ATE changed by more than the factor, with what a test over their
     seeds says.
     """
-    tested = []
+    tested = list(_effects_on_primary(pairs, systems))
+    for (system, name, effect), p in zip(tested, holm([e.p for _, _, e in tested]), strict=True):
+        if abs(math.log(effect.ratio)) <= math.log(factor):
+            continue
+        both = [pair for pair in pairs if (pair[0].sequence, pair[0].system) == (name, system)]
+        before = _median_primary(old for old, _ in both)
+        after = _median_primary(new for _, new in both)
+        verdict: Verdict = "worse" if effect.ratio > 1 else "better"
+        if p > LEVEL:
+            verdict = "cannot tell"
+        yield SequenceChange(name, system, before, after, effect, verdict)
+
+
+def _effects_on_primary(
+    pairs: Sequence[_Pair], systems: Sequence[str]
+) -> Iterator[tuple[str, str, Effect]]:
+    """Yield system, sequence and the effect on the figure that decides."""
     for system in systems:
         own = [p for p in pairs if p[0].system == system]
-        tested += [(system, name, effect_of(logs)) for name, logs in _cases(own, _PRIMARY).items()]
-    for (system, name, effect), p in zip(tested, holm([e.p for _, _, e in tested]), strict=True):
-        if abs(math.log(effect.ratio)) > math.log(factor):
-            both = [pair for pair in pairs if (pair[0].sequence, pair[0].system) == (name, system)]
-            values = (
-                [v for o in side if (v := o.value(_PRIMARY)) is not None]
-                for side in zip(*both, strict=True)
-            )
-            before, after = (float(np.median(v)) for v in values)
-            verdict: Verdict = (
-                "cannot tell" if p > LEVEL else "worse" if effect.ratio > 1 else "better"
-            )
-            yield SequenceChange(name, system, before, after, effect, verdict)
+        for name, logs in _cases(own, _PRIMARY).items():
+            yield system, name, effect_of(logs)
+
+
+def _median_primary(outcomes: Iterable[Outcome]) -> float:
+    """Return the median of the figure that decides, over the runs that have it."""
+    return float(np.median([v for o in outcomes if (v := o.value(_PRIMARY)) is not None]))
 
 
 def comparison_lines(result: Comparison) -> Iterator[str]:

@@ -78,11 +78,7 @@ def run_on_dask(
             ) from error
         except (OSError, TimeoutError, ValueError) as error:
             if first or time.monotonic() - last_s > wait_s:
-                raise VioError(
-                    f"no Dask scheduler at {address} "
-                    f"({' '.join(str(error).split()) or type(error).__name__}); start "
-                    "one with dask scheduler, and workers with dask worker"
-                ) from error
+                raise _no_scheduler(address, error) from error
         if pending:
             log.warning(
                 "the scheduler %s was lost; waiting for it with %d tasks left",
@@ -90,6 +86,14 @@ def run_on_dask(
                 len(pending),
             )
             time.sleep(_POLL_S)
+
+
+def _no_scheduler(address: str, error: Exception) -> VioError:
+    why = " ".join(str(error).split()) or type(error).__name__
+    return VioError(
+        f"no Dask scheduler at {address} ({why}); start one with dask scheduler, and workers with "
+        "dask worker"
+    )
 
 
 def _check_workers(client: Any, jobs: Mapping[str, Job]) -> None:

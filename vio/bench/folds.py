@@ -74,9 +74,7 @@ def cross_validate(outcomes: Iterable[Outcome]) -> CrossValidation:
     systems = list(dict.fromkeys(o.system for o in runs))
     if len(systems) < 2:
         raise EvaluationError("--folds compares configurations: the suite needs two or more")
-    lost = [f"{o.sequence}, {o.system}" for o in runs if o.failure is not None]
-    if lost:
-        raise EvaluationError(f"--folds needs a result of every run; without: {', '.join(lost)}")
+    _check_complete(runs)
     ratios = _log_ratios(runs, systems)
     rigs = list(ratios[systems[0]])
     if len(rigs) < 4:
@@ -94,6 +92,13 @@ def cross_validate(outcomes: Iterable[Outcome]) -> CrossValidation:
         float(np.mean([value < 0 for value in judged])),
         math.exp(float(np.mean(judged))),
     )
+
+
+def _check_complete(runs: Iterable[Outcome]) -> None:
+    """Raise EvaluationError where a run has no result."""
+    lost = [f"{o.sequence}, {o.system}" for o in runs if o.failure is not None]
+    if lost:
+        raise EvaluationError(f"--folds needs a result of every run; without: {', '.join(lost)}")
 
 
 def _log_ratios(runs: Sequence[Outcome], systems: Sequence[str]) -> _LogRatios:

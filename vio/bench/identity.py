@@ -166,17 +166,19 @@ class InputDigests:
             signature = digest_of(facts)
             if self._identity == "stat":
                 return f"stat:{signature}"
-            known = self._known.get(str(path.absolute()))
-            if known is None or known[0] != signature:
-                known = [
-                    signature,
-                    digest_of([[*_stat(f, path)[:2], _digest_file(f)] for f in _files(path)]),
-                ]
-                self._known[str(path.absolute())] = known
+            return self._digest_of_content(path, signature)
         except OSError as error:
             raise DataError(
                 f"cannot read {error.filename or path}: {error.strerror or error}"
             ) from error
+
+    def _digest_of_content(self, path: Path, signature: str) -> str:
+        """Return the digest of what the files hold; they are read where sizes and times changed."""
+        known = self._known.get(str(path.absolute()))
+        if known is None or known[0] != signature:
+            contents = [[*_stat(f, path)[:2], _digest_file(f)] for f in _files(path)]
+            known = [signature, digest_of(contents)]
+            self._known[str(path.absolute())] = known
         return known[1]
 
     def bytes_of(self, path: Path) -> int:

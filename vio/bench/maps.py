@@ -4,7 +4,8 @@ and found again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from vio.errors import EvaluationError
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
-from vio.mapping.map_store import MapStore
+from vio.mapping.map_store import LoopRow, MapStore
 from vio.protocols import Dataset
 from vio.records import (
     NS_PER_S,
@@ -214,36 +215,41 @@ def loop_figures(
     Raises:
         DataError: the file is damaged.
     """
-    held = MapStore(store, read_only=True)
-    try:
+    with contextlib.closing(MapStore(store, read_only=True)) as held:
         keyframes = held.keyframes()
         loops = [loop for loop in held.loops() if loop.kept]
-    finally:
-        held.close()
     T_world_cam = dict(zip(frames.tolist(), T_world_body @ se3_inverse(T_cam0_body), strict=True))
     true = {
         k: T_world_cam[row.frame] for k, row in enumerate(keyframes) if row.frame in T_world_cam
     }
-    errors = []
-    for loop in loops:
-        if loop.first in true and loop.second in true:
-            E = se3_inverse(loop.pose.T_i_j) @ se3_inverse(true[loop.first]) @ true[loop.second]
-            errors.append(
-                (
-                    float(np.linalg.norm(E[:3, 3])),
-                    float(np.degrees(np.linalg.norm(so3_log(E[:3, :3])))),
-                )
-            )
-    false = sum(metres > _LOOPS.false_m or degrees > _LOOPS.false_deg for metres, degrees in errors)
+    errors = list(_loop_errors(loops, true))
+    false = sum(map(_is_false, errors))
     times_ns = np.array([row.time_ns for row in keyframes], dtype=np.int64)
     revisits = _revisits(true, times_ns)
     found = {loop.second for loop in loops}
     return {
         "loops": len(loops),
         "loops_false": false,
-        "loop_error_m": float(np.median([metres for metres, _ in errors])) if errors else None,
+        "loop_error_m": float(np.median(errors, axis=0)[0]) if errors else None,
         "loop_recall": len(revisits & found) / len(revisits) if revisits else None,
     }
+
+
+def _loop_errors(
+    loops: Iterable[LoopRow], T_world_cam: Mapping[int, FloatArray]
+) -> Iterator[tuple[float, float]]:
+    """Yield what each loop between keyframes of known poses (4, 4) is off by, in m and degrees."""
+    for loop in loops:
+        if loop.first in T_world_cam and loop.second in T_world_cam:
+            T_i_j = se3_inverse(T_world_cam[loop.first]) @ T_world_cam[loop.second]
+            E = se3_inverse(loop.pose.T_i_j) @ T_i_j
+            degrees = float(np.degrees(np.linalg.norm(so3_log(E[:3, :3]))))
+            yield float(np.linalg.norm(E[:3, 3])), degrees
+
+
+def _is_false(error: tuple[float, float]) -> bool:
+    metres, degrees = error
+    return metres > _LOOPS.false_m or degrees > _LOOPS.false_deg
 
 
 def _revisits(T_world_cam: dict[int, FloatArray], times_ns: IntArray) -> set[int]:

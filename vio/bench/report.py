@@ -98,9 +98,7 @@ def _boxes(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
         stats = []
         places = []
         for j, sequence in enumerate(sequences):
-            known = [
-                o for o in outcomes if (o.sequence, o.system) == (sequence, system) and o.curve
-            ]
+            known = _with_curve(outcomes, sequence, system)
             if known:
                 stats.append(_box(_median_run(known)))
                 places.append(j * (len(systems) + 1) + k)
@@ -137,36 +135,33 @@ def _curves(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
     columns = min(3, len(sequences))
     lines = -(-len(sequences) // columns)
     systems = list(dict.fromkeys(o.system for o in outcomes if o.curve))
+    colours = {system: _COLOURS[k % len(_COLOURS)] for k, system in enumerate(systems)}
     wide = _legend_columns(systems, 4.0 * columns)
     height = 2.3 * lines + 0.2 * -(-len(systems) // wide)
     figure = Figure(figsize=(4.0 * columns, height), layout="constrained")
     for j, sequence in enumerate(sequences):
         axes = figure.add_subplot(lines, columns, j + 1)
-        for k, system in enumerate(systems):
-            known = [
-                o for o in outcomes if (o.sequence, o.system) == (sequence, system) and o.curve
-            ]
+        for system, colour in colours.items():
+            known = _with_curve(outcomes, sequence, system)
             if known:
                 curve = _median_run(known).curve
                 assert curve is not None
-                axes.plot(
-                    curve["seconds"],
-                    curve["error_m"],
-                    color=_COLOURS[k % len(_COLOURS)],
-                    lw=1.1,
-                    label=system,
-                )
+                axes.plot(curve["seconds"], curve["error_m"], color=colour, lw=1.1, label=system)
         axes.set_title(sequence, fontsize=9, loc="left", parse_math=False)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.25)
         axes.tick_params(labelsize=8)
         if j % columns == 0:
             axes.set_ylabel("error (m)", fontsize=8)
-    colours = {system: _COLOURS[k % len(_COLOURS)] for k, system in enumerate(systems)}
     handles = [Line2D([], [], color=colour, label=system) for system, colour in colours.items()]
     figure.legend(handles=handles, loc="outside upper center", ncols=wide, fontsize=8)
     figure.supxlabel("time (s)", fontsize=9)
     return figure
+
+
+def _with_curve(outcomes: Sequence[Outcome], sequence: str, system: str) -> list[Outcome]:
+    """Return the runs of a sequence with a system of which the error over time is known."""
+    return [o for o in outcomes if (o.sequence, o.system) == (sequence, system) and o.curve]
 
 
 def _system_boxes(rows: Sequence[Row]) -> Any:

@@ -96,13 +96,15 @@ def _kind(a: _Run, b: _Run, first: str) -> Kind | None:
     """Return the one thing in which two runs differ; None: it is none, or more."""
     if a.rig != b.rig:
         return None
-    if a.images == b.images:
-        if a.backward != b.backward:
-            return "backward" if a.system == b.system == first else None
-        forward = not a.backward and a.system != b.system
-        return "another configuration" if forward and first in (a.system, b.system) else None
-    drives = not (a.backward or b.backward) and a.system == b.system == first
-    return "another drive" if drives else None
+    both_first = a.system == b.system == first
+    if a.images == b.images and a.backward != b.backward:
+        return "backward" if both_first else None
+    if a.backward or b.backward:
+        return None
+    if a.images != b.images:
+        return "another drive" if both_first else None
+    differ = a.system != b.system and first in (a.system, b.system)
+    return "another configuration" if differ else None
 
 
 def agreement_lines(found: Sequence[Agreement]) -> Iterator[str]:
@@ -113,21 +115,28 @@ def agreement_lines(found: Sequence[Agreement]) -> Iterator[str]:
         for kind in _KINDS:
             own = [one.difference for one in found if (one.rig, one.kind) == (rig, kind)]
             if own:
-                nees = [one.nees for one in own]
-                cells = (
-                    _rms([one.rms_px for one in own]),
-                    _rms([one.sigma_px for one in own]),
-                    float(np.median(nees)),
-                    max(nees),
-                )
-                yield "| " + " | ".join([rig, kind, str(len(own)), *map(_text, cells)]) + " |"
+                yield _table_row([rig, kind, str(len(own))], _summary_of(own))
     yield ""
     yield "| rig | differs in | runs | difference px | stated px | NEES of 1 |"
     yield "|---|---|---|---:|---:|---:|"
     for one in found:
         values = (one.difference.rms_px, one.difference.sigma_px, one.difference.nees)
-        row = [one.rig, one.kind, " / ".join(one.runs), *map(_text, values)]
-        yield "| " + " | ".join(row) + " |"
+        yield _table_row([one.rig, one.kind, " / ".join(one.runs)], values)
+
+
+def _summary_of(differences: Sequence[FieldDifference]) -> tuple[float, float, float, float]:
+    """Return RMS difference and stated sigma in px, and the median and the largest NEES."""
+    nees = [one.nees for one in differences]
+    return (
+        _rms([one.rms_px for one in differences]),
+        _rms([one.sigma_px for one in differences]),
+        float(np.median(nees)),
+        max(nees),
+    )
+
+
+def _table_row(labels: Sequence[str], values: Iterable[float]) -> str:
+    return "| " + " | ".join([*labels, *map(_text, values)]) + " |"
 
 
 def _rms(values: Sequence[float]) -> float:

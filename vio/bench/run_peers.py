@@ -68,6 +68,16 @@ PEERS = {
 }
 
 
+def _check_helpers(name: str, peer: Peer) -> None:
+    """Raise MissingDependencyError where a program is missing that a system calls."""
+    lacking = [program for program in peer.programs if shutil.which(program) is None]
+    if lacking:
+        raise MissingDependencyError(
+            f"{name} needs {', '.join(lacking)} and gives no pose without; install Debian's package "
+            "ffmpeg, or put them on the path"
+        )
+
+
 def run_peer(
     name: str,
     suite: Suite,
@@ -95,12 +105,7 @@ def run_peer(
     """
     peer = PEERS[name]
     _check_program(name, peer, program)
-    lacking = [program for program in peer.programs if shutil.which(program) is None]
-    if lacking:
-        raise MissingDependencyError(
-            f"{name} needs {', '.join(lacking)} and gives no pose without; install Debian's package "
-            "ffmpeg, or put them on the path"
-        )
+    _check_helpers(name, peer)
     sequences = [s for s in suite.sequences if s.source is not None and not s.covered]
     if not sequences:
         raise ConfigError(f"{suite.name} has no sequence with a recording that {name} can replay")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -140,28 +140,44 @@ def suite_from(values: Any, path: Path) -> Suite:
     if not sequences:
         raise ConfigError(f"{where}: no sequences; name at least one")
     titles = _mapping(given.get("titles") or {}, where, "'titles'")
+    publisher = given.get("publisher")
     limit = given.get("time_limit_s")
+    if limit is not None:
+        limit = _positive(limit, "time_limit_s", where)
+    published = given.get("published") or ()
     suite = Suite(
         name=str(given.get("name", path.stem)),
         folder=path.resolve().parent,
-        sequences=tuple(_sequence(str(name), value, where) for name, value in sequences.items()),
-        configurations={
-            str(name): _mapping(value or {}, where, f"'{name}'")
-            for name, value in configurations.items()
-        },
+        sequences=tuple(_sequences(sequences, where)),
+        configurations=_settings_by_name(configurations, where),
         seeds=_seeds(given.get("seeds", [0]), where),
-        published=tuple(
-            _published(value, where, sequences) for value in given.get("published") or ()
-        ),
-        titles={str(name): str(title) for name, title in titles.items()},
-        publisher=None if given.get("publisher") is None else str(given["publisher"]),
+        published=tuple(_published(value, where, sequences) for value in published),
+        titles=_texts(titles),
+        publisher=None if publisher is None else str(publisher),
         success_percent=_positive(
             given.get("success_percent", SUCCESS_PERCENT), "success_percent", where
         ),
-        time_limit_s=None if limit is None else _positive(limit, "time_limit_s", where),
+        time_limit_s=limit,
     )
     _check_combinations(suite, where)
     return suite
+
+
+def _sequences(given: Mapping[Any, Any], where: str) -> Iterator[Sequence]:
+    for name, value in given.items():
+        yield _sequence(str(name), value, where)
+
+
+def _texts(given: Mapping[Any, Any]) -> dict[str, str]:
+    return {str(name): str(value) for name, value in given.items()}
+
+
+def _settings_by_name(configurations: Mapping[Any, Any], where: str) -> dict[str, Any]:
+    """Return the settings of each configuration; those of one without any are empty."""
+    return {
+        str(name): _mapping(value or {}, where, f"'{name}'")
+        for name, value in configurations.items()
+    }
 
 
 def _check_combinations(suite: Suite, where: str) -> None:
@@ -206,27 +222,24 @@ def chosen(suite: Suite, only: Iterable[str], configurations: Iterable[str]) -> 
     """
     sequences = tuple(only)
     configured = tuple(configurations)
-    for names, known in (
-        (sequences, [s.name for s in suite.sequences]),
-        (configured, list(suite.configurations)),
-    ):
-        for name in names:
-            if name not in known:
-                near = difflib.get_close_matches(name, known, 1)
-                hint = (
-                    f"; did you mean '{near[0]}'?" if near else f"; it holds {', '.join(known[:8])}"
-                )
-                raise ConfigError(f"suite {suite.name} has no '{name}'{hint}")
-    needed = {*sequences, *(s.map_of for s in suite.sequences if s.name in sequences)}
-    return replace(
-        suite,
-        sequences=tuple(s for s in suite.sequences if not sequences or s.name in needed),
-        configurations={
-            name: v
-            for name, v in suite.configurations.items()
-            if not configured or name in configured
-        },
-    )
+    _check_known(suite, sequences, [s.name for s in suite.sequences])
+    _check_known(suite, configured, list(suite.configurations))
+    if sequences:
+        needed = {*sequences, *(s.map_of for s in suite.sequences if s.name in sequences)}
+        suite = replace(suite, sequences=tuple(s for s in suite.sequences if s.name in needed))
+    if configured:
+        kept = {name: v for name, v in suite.configurations.items() if name in configured}
+        suite = replace(suite, configurations=kept)
+    return suite
+
+
+def _check_known(suite: Suite, names: Iterable[str], known: list[str]) -> None:
+    """Raise ConfigError where a suite has nothing of a name."""
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean '{near[0]}'?" if near else f"; it holds {', '.join(known[:8])}"
+            raise ConfigError(f"suite {suite.name} has no '{name}'{hint}")
 
 
 def _named(value: Any, where: str, what: str) -> Mapping[Any, Any]:
@@ -238,12 +251,15 @@ def _named(value: Any, where: str, what: str) -> Mapping[Any, Any]:
     return given
 
 
+_KEYS_OF_SEQUENCE = [f.name for f in fields(Sequence) if f.name != "name"]
+
+
 def _sequence(name: str, value: Any, where: str) -> Sequence:
     place = f"{where}, sequence {name}"
     given: dict[str, Any] = {"source": value}
     if not isinstance(value, str):
         given = dict(_mapping(value, where, f"sequence {name}"))
-    _only_keys(given, [f.name for f in fields(Sequence) if f.name != "name"], place)
+    _only_keys(given, _KEYS_OF_SEQUENCE, place)
     if ("source" in given) == ("render" in given):
         raise ConfigError(f"{place}: give either source or render")
     if "render" in given:
@@ -255,14 +271,18 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
     except (ValueError, TypeError) as error:
         text = "start and stop are frames or times as 12s, covered pairs of them, lengths_m metres"
         raise ConfigError(f"{place}: {text} ({error})") from error
+    _check_truths(given, place)
+    texts = ("source", "reference", "map_of", "rig")
+    given |= {key: str(given[key]) for key in texts if given.get(key) is not None}
+    _mapping(given.get("settings") or {}, where, f"settings of sequence {name}")
+    return Sequence(name=name, **given)
+
+
+def _check_truths(given: Mapping[str, Any], place: str) -> None:
+    """Raise ConfigError where a sequence answers a question by something else than yes or no."""
     for key in ("render_each_seed", "positions_only", "exact_truth", "map", "reverse"):
         if not isinstance(given.get(key, False), bool):
             raise ConfigError(f"{place}: {key} takes true or false, got {given[key]!r}")
-    for key in ("source", "reference", "map_of", "rig"):
-        if given.get(key) is not None:
-            given[key] = str(given[key])
-    _mapping(given.get("settings") or {}, where, f"settings of sequence {name}")
-    return Sequence(name=name, **given)
 
 
 def _render_words(words: Any, place: str) -> tuple[str, ...]:
@@ -321,27 +341,37 @@ def _published(value: Any, where: str, sequences: Iterable[str]) -> Published:
     if any(conditions[name] not in (None, True, False) for name in ("causal", "loops")):
         takes = "true, false or, where the source is silent, none"
         raise ConfigError(f"{where}: causal and loops of {system} take {takes}")
-    figures = {}
-    for name, of_sequences in given.items():
-        if name not in _PUBLISHED_FIGURES:
-            raise ConfigError(
-                f"{where}: {system} has unknown '{name}'; figures are "
-                f"{', '.join(_PUBLISHED_FIGURES)}"
-            )
-        figures[name] = {
-            str(k): v for k, v in _mapping(of_sequences, where, f"'{name}' of {system}").items()
-        }
-        for sequence, figure in figures[name].items():
-            if sequence != PUBLISHED_MEAN and sequence not in map(str, sequences):
-                raise ConfigError(
-                    f"{where}: {name} of {system} names {sequence}, which is no sequence of the "
-                    "suite"
-                )
-            if isinstance(figure, bool) or not isinstance(figure, (int, float)) or not figure >= 0:
-                raise ConfigError(
-                    f"{where}: {name} of {system} on {sequence} is a number, got {figure!r}"
-                )
+    places = {PUBLISHED_MEAN, *map(str, sequences)}
+    figures = {
+        name: _published_figures(name, value, where, system, places)
+        for name, value in given.items()
+    }
     return Published(str(system), str(source), figures, **conditions)
+
+
+def _published_figures(
+    name: str, value: Any, where: str, system: Any, places: Collection[str]
+) -> dict[str, Any]:
+    """Return the figures of one kind by sequence.
+
+    Raises:
+        ConfigError: there is no such kind or place, or a figure is no number.
+    """
+    if name not in _PUBLISHED_FIGURES:
+        raise ConfigError(
+            f"{where}: {system} has unknown '{name}'; figures are {', '.join(_PUBLISHED_FIGURES)}"
+        )
+    figures = {str(k): v for k, v in _mapping(value, where, f"'{name}' of {system}").items()}
+    for sequence, figure in figures.items():
+        if sequence not in places:
+            raise ConfigError(
+                f"{where}: {name} of {system} names {sequence}, which is no sequence of the suite"
+            )
+        if isinstance(figure, bool) or not isinstance(figure, (int, float)) or not figure >= 0:
+            raise ConfigError(
+                f"{where}: {name} of {system} on {sequence} is a number, got {figure!r}"
+            )
+    return figures
 
 
 def _positive(value: Any, name: str, where: str) -> float:

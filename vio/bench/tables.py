@@ -169,22 +169,21 @@ def _row(group: Sequence[Outcome]) -> Row:
         m.name: cell for m in BY_NAME.values() if (cell := cell_of((o.value(m) for o in group), m))
     }
     first = group[0]
-    failed = sum(o.failure is not None for o in group)
-    absent = {name: why for o in reversed(group) for name, why in o.absent.items()}
-    succeeded = (
-        None if all(o.succeeded is None for o in group) else sum(bool(o.succeeded) for o in group)
-    )
-    failure = next((o.failure for o in group if o.failure is not None), None)
+    absent = dict[str, str]()
+    for o in reversed(group):
+        absent |= o.absent
+    judged = [o.succeeded for o in group if o.succeeded is not None]
+    failures = [o.failure for o in group if o.failure is not None]
     return Row(
         first.sequence,
         first.system,
         first.seed is None,
         len(group),
-        failed,
+        len(failures),
         cells,
         absent,
-        succeeded,
-        failure,
+        sum(judged) if judged else None,
+        next(iter(failures), None),
     )
 
 
@@ -305,16 +304,10 @@ def markdown(
     ]
     if mapped := [row for row in rows if any(metric.name in row.cells for metric in OF_MAPS)]:
         parts.append("## Maps\n\n" + "\n".join(full_table(mapped, OF_MAPS)))
-    if failed := [o for o in outcomes if o.failure is not None]:
-        runs = [
-            f"{o.sequence}, {o.system}" + ("" if o.seed is None else f", seed {o.seed}")
-            for o in failed
-        ]
-        lines = [f"- {run}: {printable(o.failure)}" for run, o in zip(runs, failed, strict=True)]
-        parts.append("## Without a result\n\n" + "\n".join(lines))
-    if noted := dict.fromkeys((o.sequence, o.system, note) for o in outcomes for note in o.notes):
-        lines = [f"- {sequence}, {system}: {printable(note)}" for sequence, system, note in noted]
-        parts.append("## Doubts about the ground truth\n\n" + "\n".join(lines))
+    if failures := _failures(outcomes):
+        parts.append("## Without a result\n\n" + "\n".join(failures))
+    if doubts := _doubts(outcomes):
+        parts.append("## Doubts about the ground truth\n\n" + "\n".join(doubts))
     if suite.published:
         parts.append(
             "## Published figures\n\nTheir sources', under their conditions; ours above are "
@@ -322,6 +315,22 @@ def markdown(
             "without loops, after SE(3) alignment.\n\n" + "\n".join(published_table(suite))
         )
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
+
+
+def _failures(outcomes: Sequence[Outcome]) -> list[str]:
+    """Return a line for each run without a result."""
+    lines = []
+    for o in outcomes:
+        if o.failure is not None:
+            seed = "" if o.seed is None else f", seed {o.seed}"
+            lines.append(f"- {o.sequence}, {o.system}{seed}: {printable(o.failure)}")
+    return lines
+
+
+def _doubts(outcomes: Sequence[Outcome]) -> list[str]:
+    """Return a line for each note on a ground truth, once for all seeds."""
+    noted = dict.fromkeys((o.sequence, o.system, note) for o in outcomes for note in o.notes)
+    return [f"- {sequence}, {system}: {printable(note)}" for sequence, system, note in noted]
 
 
 def provenance(facts: Mapping[str, Any]) -> str:
@@ -347,15 +356,11 @@ def matrix(
     by name. `for_documents` gives a median without the mean.
     """
     named = titles or {}
-    known = list(dict.fromkeys(row.system for row in sorted(rows, key=lambda row: row.is_peer)))
-    columns = [s for s in systems if s in known] if systems else known
+    columns = _chosen_systems(rows, systems)
     notes = Notes()
     yield _line([metric.title, *(named.get(s, s) for s in columns)])
     yield "|---|" + "---:|" * len(columns)
-    by_sequence: dict[str, dict[str, Row]] = {}
-    for row in rows:
-        by_sequence.setdefault(row.sequence, {})[row.system] = row
-    for sequence, own in by_sequence.items():
+    for sequence, own in _by_sequence(rows).items():
         best = _best_systems({s: own[s] for s in columns if s in own}, metric)
         texts = []
         for system in columns:
@@ -363,6 +368,20 @@ def matrix(
             texts.append(f"**{text}**" if system in best else text)
         yield _line([named.get(sequence, sequence), *texts])
     yield from notes.lines()
+
+
+def _chosen_systems(rows: Iterable[Row], chosen: Sequence[str]) -> list[str]:
+    """Return the chosen ones of the systems in the rows; none chosen: all, ours first."""
+    known = dict.fromkeys(row.system for row in sorted(rows, key=lambda row: row.is_peer))
+    return [system for system in chosen if system in known] if chosen else list(known)
+
+
+def _by_sequence(rows: Iterable[Row]) -> dict[str, dict[str, Row]]:
+    """Return the rows by sequence, then by system."""
+    out: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        out.setdefault(row.sequence, {})[row.system] = row
+    return out
 
 
 def _best_systems(own: Mapping[str, Row], metric: Metric) -> list[str]:
@@ -411,28 +430,27 @@ def published_table(suite: Suite) -> Iterator[str]:
         sequences = [
             s.name for s in suite.sequences if any(s.name in p.figures[name] for p in entries)
         ]
-        yield _line(
-            [
-                BY_NAME[name].title,
-                "sensors",
-                "causal",
-                "alignment",
-                "loops",
-                *sequences,
-                "mean",
-                "source",
-            ]
-        )
+        conditions = ["sensors", "causal", "alignment", "loops"]
+        yield _line([BY_NAME[name].title, *conditions, *sequences, "mean", "source"])
         yield "|---|---|---|---|---|" + "---:|" * (len(sequences) + 1) + "---|"
         for p in entries:
-            values = [v for s in sequences if (v := p.figures[name].get(s)) is not None]
-            texts = ["–" if (v := p.figures[name].get(s)) is None else f"{v:g}" for s in sequences]
-            stated = p.figures[name].get(PUBLISHED_MEAN)
-            mean = f"{number(statistics.fmean(values), 3)} over {len(values)}" if values else "–"
-            mean = mean if stated is None else f"{stated:g} as stated"
-            yield _line([p.system, *p.conditions, *texts, mean, p.source])
+            figures = _published_cells(p.figures[name], sequences)
+            yield _line([p.system, *p.conditions, *figures, p.source])
         yield ""
     yield "– : the source has no figure of this sequence."
+
+
+def _published_cells(figures: Mapping[str, float], sequences: Sequence[str]) -> list[str]:
+    """Return the figures of the sequences, then the mean: as stated, else ours of those figures."""
+    texts = [f"{figures[s]:g}" if s in figures else "–" for s in sequences]
+    values = [figures[s] for s in sequences if s in figures]
+    if PUBLISHED_MEAN in figures:
+        mean = f"{figures[PUBLISHED_MEAN]:g} as stated"
+    elif values:
+        mean = f"{number(statistics.fmean(values), 3)} over {len(values)}"
+    else:
+        mean = "–"
+    return [*texts, mean]
 
 
 def full_table(
@@ -450,28 +468,42 @@ def full_table(
     """
     named = titles or {}
     notes = Notes()
-    names = ["sequence", "system"]
-    if for_documents:
-        names = [name for name in names if len({getattr(row, name) for row in rows}) > 1] or names[
-            1:
-        ]
+    names = _names_that_differ(rows) if for_documents else ["sequence", "system"]
     last = ["runs", "success"] if success or not for_documents else []
     yield _line([*names, *(metric.title for metric in metrics), *last])
     yield "|" + "---|" * len(names) + "---:|" * (len(metrics) + len(last))
-    before: list[str] = []
-    for row in rows:
-        runs = f"{row.runs}" if not row.failed else f"{row.runs - row.failed} of {row.runs}"
+    labels_of_rows = _labels(rows, names, named, once=for_documents)
+    for row, labels in zip(rows, labels_of_rows, strict=True):
         texts = [row_text(row, metric, notes, for_documents=for_documents) for metric in metrics]
-        share = "–" if row.succeeded is None else f"{100 * row.succeeded / row.runs:.0f} %"
-        labels = [named.get(getattr(row, name), getattr(row, name)) for name in names]
-        shown = (
-            ["", *labels[1:]]
-            if for_documents and len(labels) > 1 and labels[:1] == before
-            else labels
-        )
-        before = labels[:1]
-        yield _line([*shown, *texts, *([runs, share] if last else [])])
+        yield _line([*labels, *texts, *(_runs_and_success(row) if last else [])])
     yield from notes.lines()
+
+
+def _labels(
+    rows: Sequence[Row], names: Sequence[str], titles: Mapping[str, str], *, once: bool
+) -> Iterator[list[str]]:
+    """Yield the labels of each row; `once` leaves the first of several empty where it repeats."""
+    before = ""
+    for row in rows:
+        labels = [titles.get(getattr(row, name), getattr(row, name)) for name in names]
+        first = labels[0]
+        if once and len(labels) > 1 and first == before:
+            labels[0] = ""
+        before = first
+        yield labels
+
+
+def _names_that_differ(rows: Sequence[Row]) -> list[str]:
+    """Return which of sequence and system takes several values; where neither does, the system."""
+    names = ["sequence", "system"]
+    return [name for name in names if len({getattr(row, name) for row in rows}) > 1] or names[1:]
+
+
+def _runs_and_success(row: Row) -> list[str]:
+    """Return the cells of how many runs gave a result, and how many of them a good one."""
+    runs = f"{row.runs - row.failed} of {row.runs}" if row.failed else f"{row.runs}"
+    share = "–" if row.succeeded is None else f"{100 * row.succeeded / row.runs:.0f} %"
+    return [runs, share]
 
 
 def system_table(rows: Sequence[Row]) -> Iterator[str]:
@@ -479,30 +511,25 @@ def system_table(rows: Sequence[Row]) -> Iterator[str]:
     yield _line(["system", "sequences", *(metric.title for metric in METRICS), "success"])
     yield "|---|---:|" + "---:|" * (len(METRICS) + 1)
     for system, (done, count, cells) in summary_of(rows).items():
-        texts = []
-        for metric in METRICS:
-            cell = cells.get(metric.name)
-            worst = (
-                ""
-                if cell is None or cell.count == 1
-                else f", worst {number(cell.worst, metric.digits)}"
-            )
-            texts.append(
-                "–"
-                if cell is None
-                else f"{number(cell.median, metric.digits)}{worst} ({cell.count})"
-            )
-        own = [row for row in rows if row.system == system and row.succeeded is not None]
-        runs = sum(row.runs for row in own)
-        succeeded = sum(row.succeeded or 0 for row in own)
-        yield _line(
-            [
-                system,
-                f"{done} of {count}",
-                *texts,
-                f"{100 * succeeded / runs:.0f} % of {runs}" if runs else "–",
-            ]
-        )
+        texts = [_median_and_worst(cells.get(metric.name), metric) for metric in METRICS]
+        success = _success_of(row for row in rows if row.system == system)
+        yield _line([system, f"{done} of {count}", *texts, success])
+
+
+def _median_and_worst(cell: Cell | None, metric: Metric) -> str:
+    """Return a figure over the sequences as text, with their number in brackets."""
+    if cell is None:
+        return "–"
+    worst = "" if cell.count == 1 else f", worst {number(cell.worst, metric.digits)}"
+    return f"{number(cell.median, metric.digits)}{worst} ({cell.count})"
+
+
+def _success_of(rows: Iterable[Row]) -> str:
+    """Return the share of the runs that succeeded, over the rows that can say so."""
+    judged = [row for row in rows if row.succeeded is not None]
+    runs = sum(row.runs for row in judged)
+    succeeded = sum(row.succeeded or 0 for row in judged)
+    return f"{100 * succeeded / runs:.0f} % of {runs}" if runs else "–"
 
 
 def csv_of_rows(rows: Iterable[Row]) -> str:

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,7 +46,7 @@ from vio.evaluation.trajectories import MIN_POSES, Evaluation, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
 from vio.protocols import Dataset
-from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
+from vio.records import NS_PER_S, BoolArray, IntArray, Recording, Trajectory
 
 if TYPE_CHECKING:
     from vio.records import FrameResult
@@ -136,18 +136,27 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
     return record
 
 
+def _covered_spans(recording: Recording, covered: Sequence[Any]) -> tuple[tuple[int, int], ...]:
+    """Return the frames, each first and end, of the parts of a recording whose images are covered.
+
+    Raises:
+        DataError: a part is none of the recording.
+    """
+    total = len(recording.frame_times_ns)
+    parts = [frames_between(recording, *map(parse_bound, span)) for span in covered]
+    spans = tuple(sorted((begin, total if last is None else last) for begin, last in parts))
+    if any(begin >= last for begin, last in spans):
+        raise DataError(f"{recording.path}: a part that is covered ends before it begins")
+    return spans
+
+
 def _truth(job: dict[str, Any], config: Config) -> _Truth:
     """Open the recording of a job."""
     dataset = open_dataset(job["source"], config.dataset)
     stop = None if job["stop"] is None else parse_bound(job["stop"])
     first, end = frames_between(dataset.recording, parse_bound(job["start"]), stop)
     total = len(dataset.recording.frame_times_ns)
-    covered = [
-        frames_between(dataset.recording, *map(parse_bound, span)) for span in job["covered"]
-    ]
-    spans = tuple(sorted((begin, total if last is None else last) for begin, last in covered))
-    if any(begin >= last for begin, last in spans):
-        raise DataError(f"{dataset.recording.path}: a part that is covered ends before it begins")
+    spans = _covered_spans(dataset.recording, job["covered"])
     own = dataset.recording.reference
     reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
     if job["reverse"]:

@@ -7,13 +7,18 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from vio.cli.output import ProgressBar, print_result
 from vio.errors import ConfigError, StoppedError
 from vio.files.printable import printable
+
+if TYPE_CHECKING:
+    from vio.bench.bench import Place
+    from vio.bench.suite import Suite
 
 
 def add_parser(commands: Any) -> None:
@@ -140,30 +145,13 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _bench(args: argparse.Namespace) -> int:
-    from vio.bench.bench import Place, bench
+    from vio.bench.bench import bench
     from vio.bench.revision import revision_folder, run_in_turns
-    from vio.bench.suite import SHIPPED, chosen, read_suite
 
     if args.workers is not None and not 1 <= args.workers <= 1024:
         raise ConfigError(f"--workers takes 1 to 1024 processes, got {args.workers}")
-    suite = chosen(read_suite(args.suite), _names(args.only), _names(args.configurations))
-    _check_renders(suite)
-    if args.seeds is not None:
-        suite = _with_seeds(suite, args.seeds)
-    if args.time_limit is not None:
-        if not args.time_limit > 0:
-            raise ConfigError(f"--time-limit takes seconds above 0, got {args.time_limit:g}")
-        suite = replace(suite, time_limit_s=args.time_limit)
-    default = Path() if suite.folder == SHIPPED else suite.folder
-    place = Place(
-        data=args.data if args.data is not None else default,
-        out=args.out or Path("bench") / suite.name,
-        cache=args.cache or Path("bench") / "cache",
-        workers=args.workers or os.cpu_count() or 1,
-        scheduler=args.scheduler,
-        identity=args.identity,
-        peers=args.peers,
-    )
+    suite = _suite_of(args)
+    place = _place(suite, args)
     if args.list:
         return _list(suite, place.data, args)
     if args.run_peer is not None:
@@ -184,6 +172,40 @@ def _bench(args: argparse.Namespace) -> int:
         text = f"interrupted; finished tasks are kept in {place.cache}, and the same command goes on with the others"
         raise StoppedError(text, status=128 + getattr(stop, "number", 2)) from stop
     return _report(args, place.out, result)
+
+
+def _place(suite: Suite, args: argparse.Namespace) -> Place:
+    """Return where the suite's recordings, results and cache are, and where it runs."""
+    from vio.bench.bench import Place
+    from vio.bench.suite import SHIPPED
+
+    data = args.data
+    if data is None:
+        data = Path() if suite.folder == SHIPPED else suite.folder
+    return Place(
+        data=data,
+        out=args.out or Path("bench") / suite.name,
+        cache=args.cache or Path("bench") / "cache",
+        workers=args.workers or os.cpu_count() or 1,
+        scheduler=args.scheduler,
+        identity=args.identity,
+        peers=args.peers,
+    )
+
+
+def _suite_of(args: argparse.Namespace) -> Suite:
+    """Return the suite that is named, with the parts, seeds and time limit that are asked for."""
+    from vio.bench.suite import chosen, read_suite
+
+    suite = chosen(read_suite(args.suite), _names(args.only), _names(args.configurations))
+    _check_renders(suite)
+    if args.seeds is not None:
+        suite = _with_seeds(suite, args.seeds)
+    if args.time_limit is not None:
+        if not args.time_limit > 0:
+            raise ConfigError(f"--time-limit takes seconds above 0, got {args.time_limit:g}")
+        suite = replace(suite, time_limit_s=args.time_limit)
+    return suite
 
 
 def _with_peer(suite: Any, place: Any, args: argparse.Namespace) -> Any:
@@ -207,49 +229,38 @@ def _list(suite: Any, data: Path, args: argparse.Namespace) -> int:
     """Print what is there and what is missing; the status is 1 where something is."""
     from vio.bench.tasks import inputs_of
 
-    missing = {
-        s.name: [str(p) for p in inputs_of(s, data) if not p.exists()] for s in suite.sequences
-    }
-    lines = [
-        (name, "there" if not paths else f"missing: {', '.join(paths)}")
-        for name, paths in missing.items()
-    ]
+    missing: dict[str, list[str]] = {}
+    lines = []
+    for sequence in suite.sequences:
+        paths = [str(path) for path in inputs_of(sequence, data) if not path.exists()]
+        if paths:
+            missing[sequence.name] = paths
+        lines.append((sequence.name, f"missing: {', '.join(paths)}" if paths else "there"))
     runs = len(suite.sequences) * len(suite.configurations) * len(suite.seeds)
-    lines.append(
-        (
-            "runs",
-            f"{runs}: {', '.join(suite.configurations)}; seeds {', '.join(map(str, suite.seeds))}",
-        )
-    )
-    if any(missing.values()) and suite.publisher is not None:
+    seeds = ", ".join(map(str, suite.seeds))
+    lines.append(("runs", f"{runs}: {', '.join(suite.configurations)}; seeds {seeds}"))
+    if missing and suite.publisher is not None:
         lines.append(("from", suite.publisher))
     facts = {
         "suite": suite.name,
-        "missing": {k: v for k, v in missing.items() if v},
+        "missing": missing,
         "publisher": suite.publisher,
+        "runs": runs,
     }
-    print_result(
-        {**facts, "runs": runs}, lines, as_json=args.json, name_width=max(len(n) for n, _ in lines)
-    )
-    return 1 if any(missing.values()) else 0
+    width = max(len(name) for name, _ in lines)
+    print_result(facts, lines, as_json=args.json, name_width=width)
+    return 1 if missing else 0
 
 
 def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
     """Print the result; the status is 1 where a run has none."""
     from vio.bench.folds import cross_validate, fold_lines
-    from vio.bench.tables import METRICS, number, summary_of, summary_rows
+    from vio.bench.tables import summary_of, summary_rows
 
-    summary = summary_of(summary_rows(result.outcomes))
-    lines = []
-    for system, (done, count, cells) in summary.items():
-        shown = [
-            f"{m.title} {number(cells[m.name].median, m.digits)}"
-            for m in METRICS
-            if m.name in cells
-        ]
-        lines.append(
-            (system, f"{done} of {count} sequences; median {', '.join(shown) or 'nothing'}")
-        )
+    lines = [
+        (system, f"{done} of {count} sequences; median {_medians(cells) or 'nothing'}")
+        for system, (done, count, cells) in summary_of(summary_rows(result.outcomes)).items()
+    ]
     lines.append(("tasks", f"{len(result.outcomes)}, of which {result.reused} were done before"))
     lines.append(("report", f"{out / 'report.html'}, tables.md, tables.tex, table.csv, runs.csv"))
     facts = {**result.facts, "out": str(out), "reused": result.reused}
@@ -265,7 +276,16 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
             printable(f"failed: {outcome.sequence}, {outcome.system}: {outcome.failure}"),
             file=sys.stderr,
         )
-    return 1 if result.failures else 0
+    return int(bool(result.failures))
+
+
+def _medians(cells: Mapping[str, Any]) -> str:
+    """Return the medians of a system's figures with their titles."""
+    from vio.bench.tables import METRICS, number
+
+    return ", ".join(
+        f"{m.title} {number(cells[m.name].median, m.digits)}" for m in METRICS if m.name in cells
+    )
 
 
 def _compare(args: argparse.Namespace) -> int:

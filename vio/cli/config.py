@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from vio.cli.arguments import add_config_arguments, config_from
@@ -38,12 +38,17 @@ def execute(args: argparse.Namespace) -> int:
         return 0
     rows = list(describe(config))
     shown = rows if args.all else [row for row in rows if row.key in BASIC]
-    for group in dict.fromkeys(row.group for row in shown):
-        print(f"# {group}")
-        _print_rows(row for row in shown if row.group == group)
+    _print_by_group(shown)
     if len(shown) < len(rows):
         print(f"# {len(rows) - len(shown)} more: vio config --all")
     return 0
+
+
+def _print_by_group(rows: Sequence[SettingInfo]) -> None:
+    """Print the rows of each group under its name."""
+    for group in dict.fromkeys(row.group for row in rows):
+        print(f"# {group}")
+        _print_rows(row for row in rows if row.group == group)
 
 
 def _print_rows(rows: Iterable[SettingInfo]) -> None:

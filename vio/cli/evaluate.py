@@ -15,6 +15,7 @@ from vio.files.printable import printable
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from vio.evaluation.errors_along_path import ErrorStatistics, KittiError
     from vio.evaluation.trajectories import Evaluation
     from vio.geometry.lie import FloatArray
     from vio.records import Trajectory
@@ -131,15 +132,7 @@ def columns(text: str) -> tuple[str, ...]:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.files.atomic import check_new_file
-
-    if args.plot is None and (
-        args.axes or args.over != "distance" or args.columns != ("position",)
-    ):
-        raise ConfigError("--axes, --columns and --over say what --plot draws; give --plot too")
-
-    if args.plot is not None:
-        check_new_file(args.plot, b"\x89PNG")
+    _check_plot(args)
     estimates = {str(path): _read(path) for path in args.estimates}
     reference = _read(args.reference)
     results = {name: _evaluated(args, estimate, reference) for name, estimate in estimates.items()}
@@ -158,6 +151,16 @@ def execute(args: argparse.Namespace) -> int:
     if args.plot is not None and not args.json:
         print_result({}, [("plot", str(args.plot))], as_json=False)
     return 0
+
+
+def _check_plot(args: argparse.Namespace) -> None:
+    """Raise VioError where the picture cannot be written, or is described and not asked for."""
+    from vio.files.atomic import check_new_file
+
+    if args.plot is not None:
+        check_new_file(args.plot, b"\x89PNG")
+    elif args.axes or args.over != "distance" or args.columns != ("position",):
+        raise ConfigError("--axes, --columns and --over say what --plot draws; give --plot too")
 
 
 def _evaluated(
@@ -221,8 +224,6 @@ def _side_by_side(results: Mapping[str, Evaluation]) -> Iterator[tuple[str, str]
 
 def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
     """Yield the figures as rows of a table, one quantity each."""
-    from vio.evaluation.trajectories import lengths_text, rotation_drift_text
-
     share = f"{100 * result.coverage.estimate:.1f} % of the estimate"
     if result.coverage.reference_span is not None:
         share += f" and {100 * result.coverage.reference_span:.1f} % of the reference's span"
@@ -232,53 +233,53 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
         f"{result.matched_path_length_m:.3f} m, the reference's "
         f"{result.reference_path_length_m:.3f} m",
     )
-    yield (
-        "alignment",
-        _ALIGNMENTS[result.align]
-        + (f", scale {result.scale:.6f}" if result.align == "sim3" else ""),
-    )
-    alone = "none" in (result.aligned.orientations, result.reference.orientations)
+    scale = f", scale {result.scale:.6f}" if result.align == "sim3" else ""
+    yield "alignment", _ALIGNMENTS[result.align] + scale
     small = result.ate_m.rmse < 0.01
-    position = ("ATE", result.ate_m, *((1e3, "mm") if small else (1.0, "m")))
-    attitude = ("attitude", result.ate_deg, 1.0, "deg")
-    for name, errors, factor, unit in (position,) if alone else (position, attitude):
-        mean, middle, largest = (
-            factor * value for value in (errors.mean, errors.median, errors.max)
-        )
-        yield (
-            name,
-            f"{factor * errors.rmse:.4g} {unit} (rms), mean {mean:.4g}, median {middle:.4g}, "
-            f"largest {largest:.4g}",
-        )
-        if name == "ATE" and result.scale_free is not None:
-            off = 100 * (result.scale_free.scale - 1)
-            without = (
-                f"{1e3 * result.scale_free.ate_m:.4g} mm"
-                if small
-                else f"{result.scale_free.ate_m:.4g} m"
-            )
-            yield "scale", f"off by {off:+.3f} %; ATE {without} (rms) without it, after Sim(3)"
-    if alone:
+    yield "ATE", _errors_text(result.ate_m, *((1e3, "mm") if small else (1.0, "m")))
+    if result.scale_free is not None:
+        off = 100 * (result.scale_free.scale - 1)
+        without = _length_text(result.scale_free.ate_m, small=small)
+        yield "scale", f"off by {off:+.3f} %; ATE {without} (rms) without it, after Sim(3)"
+    if "none" in (result.aligned.orientations, result.reference.orientations):
         yield (
             "attitude",
             "not compared: a trajectory has positions alone, so RPE and drift say nothing",
         )
         return
+    yield "attitude", _errors_text(result.ate_deg, 1.0, "deg")
     if result.rpe is not None:
         step = result.rpe.trans_rmse_m
-        moved = f"{1e3 * step:.4g} mm" if step < 0.01 else f"{step:.4g} m"
+        moved = _length_text(step, small=step < 0.01)
         yield "RPE", f"{moved}, {result.rpe.rot_rmse_deg:.4g} deg (rms) from frame to frame"
     if result.kitti is None:
         yield "drift", "the path is shorter than the lengths over which it is measured"
-        return
-    turned = rotation_drift_text(result.kitti.r_err_deg_per_100m, result.kitti.lengths_m, 4)
-    yield (
-        "drift",
-        f"{result.kitti.t_err_percent:.3f} %, {turned} over {lengths_text(result.kitti.lengths_m)}",
+    else:
+        yield from _drift_rows(result.kitti)
+
+
+def _errors_text(errors: ErrorStatistics, factor: float, unit: str) -> str:
+    """Return errors as text in a unit, which is a factor times theirs."""
+    mean, middle, largest = (factor * value for value in (errors.mean, errors.median, errors.max))
+    return (
+        f"{factor * errors.rmse:.4g} {unit} (rms), mean {mean:.4g}, median {middle:.4g}, "
+        f"largest {largest:.4g}"
     )
-    for row in result.kitti.per_length:
+
+
+def _length_text(length_m: float, *, small: bool) -> str:
+    return f"{1e3 * length_m:.4g} mm" if small else f"{length_m:.4g} m"
+
+
+def _drift_rows(drift: KittiError) -> Iterator[tuple[str, str]]:
+    """Yield the drift over all lengths, then over each."""
+    from vio.evaluation.trajectories import lengths_text, rotation_drift_text
+
+    turned = rotation_drift_text(drift.r_err_deg_per_100m, drift.lengths_m, 4)
+    yield "drift", f"{drift.t_err_percent:.3f} %, {turned} over {lengths_text(drift.lengths_m)}"
+    for row in drift.per_length:
         if row.t_err_percent is not None and row.r_err_deg_per_100m is not None:
-            turned = rotation_drift_text(row.r_err_deg_per_100m, result.kitti.lengths_m, 4)
+            turned = rotation_drift_text(row.r_err_deg_per_100m, drift.lengths_m, 4)
             yield (
                 f"  {row.length_m:g} m",
                 f"{row.t_err_percent:8.3f} % {turned:>19} {row.segments:6d} segments",

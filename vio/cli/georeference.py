@@ -6,11 +6,14 @@ import argparse
 import logging
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vio.cli.output import print_result
 from vio.errors import NOTE, ConfigError
 from vio.files.printable import json_text
+
+if TYPE_CHECKING:
+    from vio.geometry.lie import FloatArray
 
 
 def add_parser(commands: Any) -> None:
@@ -55,33 +58,21 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    import numpy as np
-
     from vio.datasets.gnss import read_gnss
     from vio.files.atomic import atomic_folder
     from vio.mapping.map_store import is_map
     from vio.numerics.threads import one_blas_thread
     from vio.offline.georeference import FACTS, keep_in_map, place_by_map, place_on_earth, placed
 
-    try:
-        lever_arm_m = np.array([float(word) for word in args.lever_arm.split(",")])
-    except ValueError:
-        lever_arm_m = np.zeros(0)
-    if lever_arm_m.shape != (3,) or not (np.abs(lever_arm_m) < 1e3).all():
-        raise ConfigError(
-            f"--lever-arm takes three numbers in metres such as 0.1,0,-0.5, got {args.lever_arm}"
-        )
+    lever_arm_m = _lever_arm(args.lever_arm)
     if not math.isfinite(args.time_offset) or abs(args.time_offset) > 4e9:
         raise ConfigError(f"--time-offset takes seconds, got {args.time_offset:g}")
     of = placed(args.path)
     fixes = None if is_map(args.gnss) else read_gnss(args.gnss, args.topic)
     for note in () if fixes is None else fixes.notes:
         logging.getLogger(__name__).log(NOTE, "%s", note)
-    out = args.out or (
-        args.path / "earth"
-        if args.path.is_dir()
-        else args.path.with_name(f"{args.path.name}.earth")
-    )
+    is_run = args.path.is_dir()
+    out = args.out or _usual_folder(args.path)
     with one_blas_thread(), atomic_folder(out, replace=True, marker=FACTS) as folder:
         facts = {"out": str(out), "of": str(args.path), "gnss": str(args.gnss)}
         if fixes is None:
@@ -89,9 +80,33 @@ def execute(args: argparse.Namespace) -> int:
         else:
             facts |= place_on_earth(of, fixes, lever_arm_m, args.time_offset, folder)
         (folder / FACTS).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
-    if fixes is not None and not args.path.is_dir():
+    if fixes is not None and not is_run:
         keep_in_map(args.path, facts)
     return print_result(facts, _rows(facts), as_json=args.json)
+
+
+def _lever_arm(text: str) -> FloatArray:
+    """Return the position (3,) of the antenna in the body frame in metres.
+
+    Raises:
+        ConfigError: the text is no three numbers, or they are too large.
+    """
+    import numpy as np
+
+    try:
+        lever_arm_m = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        lever_arm_m = np.zeros(0)
+    if lever_arm_m.shape != (3,) or not (np.abs(lever_arm_m) < 1e3).all():
+        raise ConfigError(
+            f"--lever-arm takes three numbers in metres such as 0.1,0,-0.5, got {text}"
+        )
+    return lever_arm_m
+
+
+def _usual_folder(path: Path) -> Path:
+    """Return the folder of the results: in a run's folder, or beside a map."""
+    return path / "earth" if path.is_dir() else path.with_name(f"{path.name}.earth")
 
 
 def _rows(f: dict[str, Any]) -> list[tuple[str, str]]:

@@ -70,7 +70,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets.rigs import load_rig
-    from vio.sources.run import run_source
+    from vio.sources.run import LiveOptions, run_source
     from vio.sources.source import open_source
 
     if args.target is not None:
@@ -110,13 +110,9 @@ def execute(args: argparse.Namespace) -> int:
             open_source(args.source, args.layout),
             config,
             rig,
+            LiveOptions(kept, args.record, args.record_as, map_use, args.drop),
             should_stop=asked.reason,
             say=lambda line: print(line, file=sys.stderr, flush=True),
-            kept=kept,
-            record=args.record,
-            record_as=args.record_as,
-            map=map_use,
-            drop=args.drop,
             on_start=show,
         )
     for viewer in viewers:

@@ -46,7 +46,7 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets import open_dataset
     from vio.ros2.opening import open_transport
-    from vio.ros2.play import play
+    from vio.ros2.play import Playing, play
     from vio.ros2.sensors import SensorTopics
 
     rate = _rate(args.rate)
@@ -59,11 +59,13 @@ def execute(args: argparse.Namespace) -> int:
             transport,
             dataset,
             SensorTopics(args.left, args.right, args.imu),
-            rate=rate,
-            quality="reliable" if args.reliable else "sensor",
-            should_stop=asked.reason,
-            wait=not args.now,
-            stop=args.stop,
+            Playing(
+                rate,
+                "reliable" if args.reliable else "sensor",
+                wait=not args.now,
+                stop=args.stop,
+            ),
+            asked.reason,
         )
     print(f"{played.frames} frames and {played.samples} IMU samples published")
     return 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from vio.cli.output import ProgressBar, print_result
 from vio.errors import ConfigError
@@ -201,29 +201,39 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
     from vio.sim.scenarios import Scenario
 
     car = args.trajectory == "car"
+    usual_hz = 10.0 if car else 20.0
     if args.frame_times is not None and args.rate is not None:
         raise ConfigError("--frame-times and --rate exclude each other; give one of them")
     trajectory, frame_times, imu = _flight(args)
-    rig: Any = args.rig or (
-        "euroc" if isinstance(trajectory, Path) else "kitti" if car else "euroc-rectified"
-    )
+    rig: Any = args.rig or _usual_rig(trajectory, car=car)
     form = _form_of(args, rig, imu)
+    usual_velocity: Literal["none", "paper"] = "none"
     if form == "kitti":
         imu = "none"
+        usual_velocity = "paper"
+    elif imu is None:
+        imu = "simulated"
     scenario = Scenario(
         scene=args.scene,
         trajectory=trajectory,
         frame_times=frame_times,
-        imu=imu if imu in ("simulated", "none") else "simulated" if imu is None else Path(imu),
-        velocity=args.velocity or ("paper" if form == "kitti" else "none"),
+        imu=imu if imu in ("simulated", "none") else Path(imu),
+        velocity=args.velocity or usual_velocity,
         rig=rig,
         width=args.width,
-        rate_hz=(10.0 if car else 20.0) if args.rate is None else args.rate,
+        rate_hz=usual_hz if args.rate is None else args.rate,
         duration_s=args.duration,
         conditions=_conditions(args),
         seed=args.seed,
     )
     return scenario, form
+
+
+def _usual_rig(trajectory: object, *, car: bool) -> str:
+    """Return the rig that goes with a flight of a file, with a car, or with a simulated flight."""
+    if isinstance(trajectory, Path):
+        return "euroc"
+    return "kitti" if car else "euroc-rectified"
 
 
 def _flight(args: argparse.Namespace) -> tuple[Any, Any, Any]:

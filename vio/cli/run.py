@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vio.cli.arguments import (
     add_config_arguments,
@@ -16,6 +16,9 @@ from vio.cli.arguments import (
 )
 from vio.cli.output import print_result
 from vio.errors import ConfigError
+
+if TYPE_CHECKING:
+    from vio.cli.running import Shown
 
 
 def add_parser(commands: Any) -> None:
@@ -93,13 +96,9 @@ _OF_A_NEW_RUN = (
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.cli.running import RunOptions, Shown, metric_rows, process, resume
+    from vio.cli.running import RunOptions, Shown, metric_rows, process
 
-    if args.open and not args.report:
-        raise ConfigError("--open shows the page of --report; give both")
-    mapped = args.map is not None or args.resume is not None
-    if args.map_density is not None and (not mapped or args.map_density < 1):
-        raise ConfigError("--map-density is of a --map, and at least 1")
+    _check_combinations(args)
 
     def finished(metrics: dict[str, Any]) -> None:
         print_result(metrics, metric_rows(metrics, plot=not args.no_plot), as_json=args.json)
@@ -111,16 +110,7 @@ def execute(args: argparse.Namespace) -> int:
         own = args.frontend
         args.frontend = None
     if args.resume is not None:
-        given = [f"--{name.replace('_', '-')}" for name in _OF_A_NEW_RUN if getattr(args, name)]
-        if given:
-            raise ConfigError(f"--resume goes on as the run began; leave out {', '.join(given)}")
-        resume(
-            args.resume,
-            save_calibration=args.save_calibration,
-            map_file=args.map,
-            frontend=own,
-            shown=shown,
-        )
+        _resume(args, own, shown)
         return _reported(args.resume, shown=args.open) if args.report else 0
     options = RunOptions(
         out=args.out,
@@ -138,6 +128,35 @@ def execute(args: argparse.Namespace) -> int:
     )
     metrics = process(args.source, config_from(args), options, shown)
     return _reported(Path(metrics["out"]), shown=args.open) if args.report else 0
+
+
+def _check_combinations(args: argparse.Namespace) -> None:
+    """Raise ConfigError where an option is given without the one that it belongs to."""
+    if args.open and not args.report:
+        raise ConfigError("--open shows the page of --report; give both")
+    mapped = args.map is not None or args.resume is not None
+    if args.map_density is not None and (not mapped or args.map_density < 1):
+        raise ConfigError("--map-density is of a --map, and at least 1")
+
+
+def _resume(args: argparse.Namespace, frontend: str | None, shown: Shown) -> None:
+    """Go on with an unfinished run.
+
+    Raises:
+        ConfigError: options are given that are those of a new run.
+    """
+    from vio.cli.running import resume
+
+    given = [f"--{name.replace('_', '-')}" for name in _OF_A_NEW_RUN if getattr(args, name)]
+    if given:
+        raise ConfigError(f"--resume goes on as the run began; leave out {', '.join(given)}")
+    resume(
+        args.resume,
+        save_calibration=args.save_calibration,
+        map_file=args.map,
+        frontend=frontend,
+        shown=shown,
+    )
 
 
 def _reported(folder: Path, *, shown: bool) -> int:

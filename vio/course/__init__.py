@@ -22,15 +22,7 @@ def copy_course(folder: Path, *, solutions: bool = False) -> list[Path]:
     Raises:
         DataError: a file of that name has another content, such as a student's work.
     """
-    found = sorted(
-        (entry for entry in resources.files(__name__).iterdir() if _is_copied(entry.name)),
-        key=lambda entry: entry.name,
-    )
-    contents = {
-        folder / entry.name: entry.read_bytes()
-        for entry in found
-        if solutions or not entry.name.endswith(_SOLUTION)
-    }
+    contents = {folder / name: content for name, content in _files(solutions=solutions).items()}
     for path, content in contents.items():
         if path.exists() and (not path.is_file() or read_input(path) != content):
             raise DataError(
@@ -41,6 +33,15 @@ def copy_course(folder: Path, *, solutions: bool = False) -> list[Path]:
         if not path.exists():
             atomic_write_bytes(path, content)
     return list(contents)
+
+
+def _files(*, solutions: bool) -> dict[str, bytes]:
+    """Return the content of the course's files by name, in their order."""
+    entries = {entry.name: entry for entry in resources.files(__name__).iterdir()}
+    names = [name for name in sorted(entries) if _is_copied(name)]
+    if not solutions:
+        names = [name for name in names if not name.endswith(_SOLUTION)]
+    return {name: entries[name].read_bytes() for name in names}
 
 
 def _is_copied(name: str) -> bool:

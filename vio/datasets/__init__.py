@@ -67,12 +67,7 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
         CalibrationError: the recording's calibration is invalid.
     """
     kind, path = _parse(os.fspath(source))
-    if path.is_symlink() and not path.exists():
-        raise DataError(
-            f"{path} is a link to {os.readlink(path)}, which leads nowhere; give {_looked_for()}"
-        )
-    if not path.exists():
-        raise DataError(_missing(path))
+    _check_there(path)
     settings = options or DatasetSettings()
     if kind is None:
         kind = "plain" if settings.folders is not None and path.is_dir() else _detect(path)
@@ -86,6 +81,16 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
     from vio.datasets.left_camera import left_camera
 
     return left_camera(dataset)
+
+
+def _check_there(path: Path) -> None:
+    """Raise DataError where a path does not exist, or is a link to one that does not."""
+    if path.is_symlink() and not path.exists():
+        raise DataError(
+            f"{path} is a link to {os.readlink(path)}, which leads nowhere; give {_looked_for()}"
+        )
+    if not path.exists():
+        raise DataError(_missing(path))
 
 
 def in_colour(dataset: Dataset) -> Dataset:
@@ -207,18 +212,20 @@ def _folder_kind(path: Path) -> str | None:
             "it by vio eval, or "
             "give its observations.npz (of --save-observations)"
         )
-    for reader in _readers():
-        if reader.is_folder(path):
-            return reader.kind
-    for reader in _readers():
-        if reader.may_be_folder(path):
-            return reader.kind
-    if "sequences" in names:
+    kind = _kind_of_folder(path)
+    if kind is None and "sequences" in names:
         raise DataError(
             f"{path} holds several KITTI sequences; name one of them, such as "
             f"{path / 'sequences' / '00'}"
         )
-    return None
+    return kind
+
+
+def _kind_of_folder(path: Path) -> str | None:
+    """Return the kind of the first reader that recognises a folder, else of one that may read it."""
+    sure = (reader.kind for reader in _readers() if reader.is_folder(path))
+    possible = (reader.kind for reader in _readers() if reader.may_be_folder(path))
+    return next(sure, None) or next(possible, None)
 
 
 def _file_kind(path: Path) -> str | None:

@@ -49,17 +49,9 @@ _SHARED_FOLDERS = ("calibration", "extras")  # of 4Seasons and Monado
 
 def calibration_beside(layout: Layout) -> Path | None:
     """Return the calibration file of a recording; None: there is none."""
-    above = [layout.root.parent] if layout.root.name == "mav0" else []
-    folders = [
-        base / inside
-        for base in dict.fromkeys((layout.root, layout.base, *above))
-        for inside in _CALIBRATION_FOLDERS
-    ]
-    # beside the recordings of one rig
-    folders += [layout.root.absolute().parent / name for name in _SHARED_FOLDERS]
     if is_pair_of_eth3d(layout):
         return layout.root / EXTRINSICS
-    for folder in folders:
+    for folder in _folders_of_calibrations(layout):
         if not folder.is_dir():
             continue
         if "undistorted" in str(layout.left) and (folder / STEREO).is_file():
@@ -67,6 +59,15 @@ def calibration_beside(layout: Layout) -> Path | None:
         if (found := rigs.find_calibration(folder)) is not None:
             return found
     return None
+
+
+def _folders_of_calibrations(layout: Layout) -> list[Path]:
+    """Return where a recording's calibration may lie: in it, above it, or beside all of its rig."""
+    above = [layout.root.parent] if layout.root.name == "mav0" else []
+    own = dict.fromkeys((layout.root, layout.base, *above))
+    folders = [base / inside for base in own for inside in _CALIBRATION_FOLDERS]
+    shared = layout.root.absolute().parent
+    return [*folders, *(shared / name for name in _SHARED_FOLDERS)]
 
 
 def find_calibration_of(layout: Layout) -> Path:
@@ -150,41 +151,40 @@ def parts_of(
     return recording, beside.motion, sizes, settings, rectifier
 
 
+@dataclass(frozen=True, slots=True)
+class ReadImages:
+    """What was read of the images of a recording, before what lies beside them."""
+
+    kind: str  # of the recording
+    layout: Layout  # where its parts lie
+    calibration: tuple[Path, Rig]  # the file, and its rig
+    times: tuple[IntArray, Path | None]  # of the frames (F,), and their file; None: assumed
+    notes: Sequence[str]  # about images and times
+    used: Sequence[Path]  # further files and folders that were read, or are known not to matter
+    has_depths: bool = False  # whether one camera has depth images
+
+
 def read_companions(
-    kind: str,
-    layout: Layout,
-    calibration: tuple[Path, Rig],
-    settings: DatasetSettings,
-    times: tuple[IntArray, Path | None],
-    notes: Sequence[str],
-    used: Sequence[Path],
-    *,
-    reference: Trajectory | None = None,
-    has_depths: bool = False,
+    images: ReadImages, settings: DatasetSettings, reference: Trajectory | None = None
 ) -> Parts:
     """Read what lies beside images: the pose of the IMU, its samples, velocities and ground truth.
 
     Args:
-        kind: of the recording.
-        layout: where its parts lie.
-        calibration: the file and its rig.
+        images: what was read of the images.
         settings: reader settings.
-        times: of the frames (F,), and the file that they are from; None: assumed.
-        notes: about images and times.
-        used: further files and folders that were read, or are known not to matter.
         reference: ground truth that was read already.
-        has_depths: whether one camera has depth images.
 
     Raises:
         DataError: samples or ground truth cannot be used.
         CalibrationError: the rig cannot be rectified, or samples need the pose of their sensor.
     """
-    (file, rig) = calibration
-    (times_ns, times_file) = times
+    layout = images.layout
+    (file, rig) = images.calibration
+    (times_ns, times_file) = images.times
     rig, extrinsics = _with_extrinsics(rig, layout, file)
     motion, motion_files, motion_notes = _read_motion(layout, rig, times_ns, times_file is not None)
     with naming(file):
-        depth_noise = settings.depth_noise if has_depths else None
+        depth_noise = settings.depth_noise if images.has_depths else None
         rectifier = rig.rectifier(
             settings.interpolation, settings.projection, depth_noise=depth_noise
         )
@@ -196,12 +196,12 @@ def read_companions(
         motion,
         motion_notes,
         reference,
-        [*read, *extrinsics, *motion_files, *used],
-        (*notes, *rig.notes),
+        [*read, *extrinsics, *motion_files, *images.used],
+        (*images.notes, *rig.notes),
         [file] * len(rig.cameras),
     )
     has_body = rig.T_cam0_imu is not None and (rig.cam1 is not None or len(motion_files) > 0)
-    return parts_of(kind, layout, rectifier, settings, times_ns, beside, has_body=has_body)
+    return parts_of(images.kind, layout, rectifier, settings, times_ns, beside, has_body=has_body)
 
 
 def _with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Path]]:
@@ -223,10 +223,7 @@ def _read_motion(
     """Read the IMU and the velocities, on the clock of the images; return the samples, their
     files and notes.
     """
-    imu = next(
-        (f for base in (layout.root, layout.base) for n in IMU_FILES if (f := base / n).is_file()),
-        None,
-    )
+    imu = _imu_file(layout)
     velocity = layout.root / "velocity.csv"
     files = [f for f in (imu, velocity) if f is not None and f.is_file()]
     others = _other_imu_notes(layout) if imu is None else []
@@ -255,6 +252,12 @@ def _read_motion(
         check_overlap(times_ns, speeds.times_ns, velocity)
         parts.append(speeds)
     return in_time_order(*parts), files, notes
+
+
+def _imu_file(layout: Layout) -> Path | None:
+    """Return the table of the IMU; None: there is none."""
+    named = (base / name for base in (layout.root, layout.base) for name in IMU_FILES)
+    return next((file for file in named if file.is_file()), None)
 
 
 def _other_imu_notes(layout: Layout) -> list[str]:

@@ -86,11 +86,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
     levels, depth_notes = gray_levels(pairs)
     candidates = (mav / STATE_CSV, mav.absolute().parent / TUM_FILE)
     truth = next((file for file in candidates if file.is_file()), None)
-    read = [
-        mav / name / file
-        for name in ("cam0", "cam1", "imu0")
-        for file in ("sensor.yaml", "data.csv")
-    ]
+    folders = [mav / name for name in ("cam0", "cam1", "imu0")]
+    read = [folder / file for folder in folders for file in ("sensor.yaml", "data.csv")]
     layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
     reference = None if truth is None else _read_reference(truth, T_body_imu, rig.T_imu_cam0)
     beside = Beside(
@@ -99,7 +96,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
         reference,
         read if truth is None else [*read, truth],
         (*notes, *depth_notes),
-        [mav / name / "sensor.yaml" for name in ("cam0", "cam1")],
+        [mav / "cam0" / "sensor.yaml", mav / "cam1" / "sensor.yaml"],
     )
     parts = parts_of("euroc", layout, rectifier, settings, times_ns, beside)
     return ImageDataset(*parts, pairs, imu_noise=noise, levels=levels)
@@ -144,15 +141,17 @@ def _find_images(
     by_name = set(there.names)
     by_stem = {stem_of(name): name for name in there.names}
     found = [name if name in by_name else by_stem.get(Path(name).stem) for name in names]
-    missing = [k for k, file in enumerate(found) if file is None]
-    if missing and (missing[0] == 0 or len(missing) < len(names) - missing[0]):
+    present = tuple(file for file in found if file is not None)
+    missing = len(found) - len(present)
+    if missing and (not present or found[: len(present)] != list(present)):
+        first = found.index(None)
         raise DataError(
-            f"{path}, line {lines[missing[0]]}: {there.folder / names[missing[0]]} is missing "
-            f"({len(missing)} of "
+            f"{path}, line {lines[first]}: {there.folder / names[first]} is missing "
+            f"({missing} of "
             f"{len(names)} listed images are); copy it again, or remove such lines"
         )
-    files = ImageFiles(there.folder, tuple(file for file in found if file is not None))
-    return files, sum(file != name for file, name in zip(files.names, names, strict=False))
+    others = sum(file != name for file, name in zip(present, names, strict=False))
+    return ImageFiles(there.folder, present), others
 
 
 def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray, tuple[str, ...]]:

@@ -44,11 +44,7 @@ def read_gnss(path: Path, topic: str | None = None) -> GnssFixes:
 
 def _read_csv(path: Path) -> GnssFixes:
     """Read a table with or without the standard deviations; empty or NaN: not known."""
-    lines = [
-        line for _, line in text_lines(path) if line.strip() and not line.lstrip().startswith("#")
-    ]
-    last = lines[-1].replace(";", ",") if lines else ""
-    columns = 4 if len(last.split("," if "," in last else None)) == 4 else 7
+    columns = 4 if _width_of_last_row(path) == 4 else 7
     table = read_table(path, columns, _FORM)
     if table.header and not all(
         word in name for word, name in zip(("time", "lat", "lon"), table.header, strict=False)
@@ -60,6 +56,15 @@ def _read_csv(path: Path) -> GnssFixes:
     sigmas[no_up, 2] = UP_SHARE * sigmas[no_up, :2].max(axis=1)
     times_ns = check_increasing(stamps_ns(table), table.where)
     return checked_fixes(times_ns, values[:, :3], np.eye(3) * sigmas[:, None, :] ** 2, str(path))
+
+
+def _width_of_last_row(path: Path) -> int:
+    """Return how many cells the last row of a table has that is no comment; 0: there is none."""
+    last = ""
+    for _, line in text_lines(path):
+        if line.strip() and not line.lstrip().startswith("#"):
+            last = line.replace(";", ",")
+    return len(last.split("," if "," in last else None))
 
 
 def _read_oxts(folder: Path) -> GnssFixes:
@@ -96,36 +101,42 @@ def _read_navsatfix(path: Path, topic: str | None) -> GnssFixes:
     covariances = []
     lost = 0
     with Bag(path) as bag:
-        found = [
-            t.name
-            for t in bag.topics
-            if t.kind == _NAVSATFIX and t.count and topic in (None, t.name)
-        ]
-        if len(found) != 1:
-            names = ", ".join(found) or "none"
-            raise DataError(
-                f"{path}: topics of NavSatFix: {names}; name one with --topic, or give another bag"
-            )
-        for message in bag.messages(found):
+        name = _topic_of_fixes(bag, path, topic)
+        for message in bag.messages([name]):
             fix = bag.decoded(message)
             if int(fix.status.status) <= _NO_FIX:
                 lost += 1
                 continue
-            known = int(fix.position_covariance_type) != _UNKNOWN
             times.append(stamp_of(fix) or message.logged_ns)
             positions.append([float(fix.latitude), float(fix.longitude), float(fix.altitude)])
-            covariances.append(
-                np.array(fix.position_covariance, dtype=np.float64).reshape(3, 3)
-                if known
-                else np.full((3, 3), np.nan)
-            )
-    notes = (f"{lost} messages of {found[0]} say that there is no fix",) if lost else ()
+            covariance = np.full(9, np.nan)
+            if int(fix.position_covariance_type) != _UNKNOWN:
+                covariance = np.array(fix.position_covariance, dtype=np.float64)
+            covariances.append(covariance.reshape(3, 3))
+    notes = (f"{lost} messages of {name} say that there is no fix",) if lost else ()
     if not times:
-        raise DataError(f"{path}: {found[0]} holds no position; give a record with a fix")
+        raise DataError(f"{path}: {name} holds no position; give a record with a fix")
     return checked_fixes(
         np.array(times, dtype=np.int64),
         np.array(positions),
         np.array(covariances),
-        f"{path}, {found[0]}",
+        f"{path}, {name}",
         notes,
     )
+
+
+def _topic_of_fixes(bag: Bag, path: Path, named: str | None) -> str:
+    """Return the only topic of NavSatFix that has messages, or the one named.
+
+    Raises:
+        DataError: there are none or several.
+    """
+    found = [
+        t.name for t in bag.topics if t.kind == _NAVSATFIX and t.count and named in (None, t.name)
+    ]
+    if len(found) != 1:
+        names = ", ".join(found) or "none"
+        raise DataError(
+            f"{path}: topics of NavSatFix: {names}; name one with --topic, or give another bag"
+        )
+    return found[0]

@@ -8,7 +8,7 @@ in the unit of its header. Names alone are read by their size, and by how far ap
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -156,17 +156,26 @@ def _partner_keys(lefts: ImageFiles, rights: ImageFiles) -> list[list[str | int]
     left_ns = _name_times(lefts)
     right_ns = _name_times(rights)
     if left_ns is not None and right_ns is not None and 2 * shared < min(len(lefts), len(rights)):
-        a, b = pair_stamps(left_ns, right_ns)
-        keys = [list(range(len(lefts))), [-1] * len(rights)]
-        for i, j in zip(a.tolist(), b.tolist(), strict=True):
-            keys[1][j] = i
-        return keys
-    if shared:
-        return keys
+        return _keys_of_times(left_ns, right_ns)
+    return keys if shared else _keys_in_names(lefts, rights)
+
+
+def _keys_in_names(lefts: ImageFiles, rights: ImageFiles) -> list[list[str | int]]:
+    """Return the names without their sides where some are shared then, else their last numbers."""
+    keys: list[list[str | int]]
     keys = [[without_side(p.stem) for p in files] for files in (lefts, rights)]
     if not set(keys[0]) & set(keys[1]):
         keys = [[_last_number(p) for p in files] for files in (lefts, rights)]
     return keys
+
+
+def _keys_of_times(left_ns: IntArray, right_ns: IntArray) -> list[list[str | int]]:
+    """Return the rows of the left files, and for each right one that of the nearest left one."""
+    rights: list[str | int] = [-1] * len(right_ns)
+    a, b = pair_stamps(left_ns, right_ns)
+    for i, j in zip(a.tolist(), b.tolist(), strict=True):
+        rights[j] = i
+    return [list(range(len(left_ns))), rights]
 
 
 def _last_number(path: Path) -> int | str:
@@ -191,25 +200,38 @@ def _name_times(
     dates_ns = dates_in_names([file.stem for file in files])
     if dates_ns is not None:
         return dates_ns if (np.diff(dates_ns) > 0).all() else None
-    found = [_STAMP.fullmatch(file.stem) for file in files]
-    texts = [match["time"] for match in found if match is not None]
-    units = {match["unit"] for match in found if match is not None}
-    if len(texts) < len(files) or len(units) != 1:
+    named = _stamps_in_names(files)
+    if named is None:
         return None
-    since_1970_alone = since_1970_alone or any(match and match["number"] for match in found)
-    unit = units.pop()
+    texts, unit, numbered = named
     stated = None if unit is None else TIME_UNITS[unit]
-    seconds = any("." in text for text in texts) and all(map(_SECONDS.fullmatch, texts))
-    since_1970 = seconds or all(map(_SINCE_1970.fullmatch, texts))
+    seconds = _are_seconds(texts)
     if seconds:
         check_digits(texts, lambda k: str(files[k]))
-    boot = stated is not None or _could_be_times(texts)
-    if not since_1970 and (since_1970_alone or not boot):
+    may_be_since_boot = not (since_1970_alone or numbered)
+    since_boot = may_be_since_boot and (stated is not None or _could_be_times(texts))
+    if not since_boot and not seconds and not all(map(_SINCE_1970.fullmatch, texts)):
         return None
     try:
         return parse_stamps(texts, lambda k: str(files[k]), stated, pace=FRAME_PACE, doubts=doubts)
     except DataError:  # numbers of something else, which do not increase
         return None
+
+
+def _stamps_in_names(files: Sequence[Path]) -> tuple[list[str], str | None, bool] | None:
+    """Return the stamps that all files are named by, the unit in their names, where there is one,
+    and whether numbers of frames are beside them; None: some are named otherwise.
+    """
+    found = [match for file in files if (match := _STAMP.fullmatch(file.stem)) is not None]
+    units = {match["unit"] for match in found}
+    if len(found) < len(files) or len(units) != 1:
+        return None
+    return [match["time"] for match in found], units.pop(), any(match["number"] for match in found)
+
+
+def _are_seconds(texts: Sequence[str]) -> bool:
+    """Tell whether all are times of a date in seconds, with decimals."""
+    return any("." in text for text in texts) and all(map(_SECONDS.fullmatch, texts))
 
 
 def _could_be_times(texts: Sequence[str]) -> bool:
@@ -234,11 +256,10 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
         DataError: `times.txt` does not fit the images, or the times do not increase.
     """
     doubts = list[str]()
-    for folder in dict.fromkeys((layout.base, layout.root, layout.left, layout.left.parent)):
-        for name in ("times.txt", "timestamps.txt"):
-            if (file := folder / name).is_file():
-                times_ns = times_of(file, pairs, doubts)
-                return times_ns, file, (*doubts, *_slow_note(file, times_ns))
+    file = _file_of_times(layout)
+    if file is not None:
+        times_ns = times_of(file, pairs, doubts)
+        return times_ns, file, (*doubts, *_slow_note(file, times_ns))
     lefts = [left for left, _ in pairs]
     file = layout.left.parent / "data.csv"
     missing: tuple[str, ...] = ()
@@ -262,6 +283,13 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
         "write one time an image (seconds or nanoseconds) into times.txt"
     )
     return np.arange(len(pairs), dtype=np.int64) * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
+
+
+def _file_of_times(layout: Layout) -> Path | None:
+    """Return the list of times beside the images; None: there is none."""
+    folders = dict.fromkeys((layout.base, layout.root, layout.left, layout.left.parent))
+    named = (folder / name for folder in folders for name in ("times.txt", "timestamps.txt"))
+    return next((file for file in named if file.is_file()), None)
 
 
 def _slow_note(file: Path, times_ns: IntArray) -> tuple[str, ...]:
@@ -328,16 +356,13 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
     ):
         return drive_times(file, np.array(numbers, dtype=np.int64))
     rows, stated = time_lines(file)
-    by_name = {Path(fields[0]).stem: (n, fields[1]) for n, fields in rows if len(fields) > 1}
-    if by_name and all(left.stem in by_name for left, _ in pairs):
-        chosen = [by_name[left.stem] for left, _ in pairs]
-    elif (found := _by_number_or_time_first(rows, pairs)) is not None:
-        chosen = found
-    elif len(rows) == len(pairs) and all(len(fields) == 1 for _, fields in rows):
-        chosen = [(n, fields[0]) for n, fields in rows]
-    elif (of_all := _of_all_images(rows, pairs)) is not None:
-        chosen = of_all
-    else:
+    chosen = (
+        _by_name_first(rows, pairs)
+        or _by_number_or_time_first(rows, pairs)
+        or _in_order(rows, pairs)
+        or _of_all_images(rows, pairs)
+    )
+    if chosen is None:
         raise DataError(
             f"{file} holds {len(rows)} times for {len(pairs)} image pairs; there must be one time "
             "an image, or lines "
@@ -352,6 +377,25 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
     )
 
 
+def _by_name_first(
+    rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs
+) -> list[tuple[int, str]] | None:
+    """Return line and time of each pair from lines 'name time'; None: the lines are others."""
+    by_name = {Path(fields[0]).stem: (n, fields[1]) for n, fields in rows if len(fields) > 1}
+    if not by_name or not all(left.stem in by_name for left, _ in pairs):
+        return None
+    return [by_name[left.stem] for left, _ in pairs]
+
+
+def _in_order(
+    rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs
+) -> list[tuple[int, str]] | None:
+    """Return line and time of each pair from lines with a time alone; None: they are others."""
+    if len(rows) != len(pairs) or any(len(fields) != 1 for _, fields in rows):
+        return None
+    return [(n, fields[0]) for n, fields in rows]
+
+
 def _by_number_or_time_first(
     rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs
 ) -> list[tuple[int, str]] | None:
@@ -360,17 +404,26 @@ def _by_number_or_time_first(
     """
     if not rows or any(len(fields) != 2 for _, fields in rows):
         return None
-    by_name = {Path(fields[1]).stem: (n, fields[0]) for n, fields in rows}
-    if all(left.stem in by_name for left, _ in pairs):
-        return [by_name[left.stem] for left, _ in pairs]
+    swapped = [(n, fields[::-1]) for n, fields in rows]
+    by_name = _by_name_first(swapped, pairs)
+    if by_name is not None:
+        return by_name
     if not all(fields[0].isdigit() for _, fields in rows):
         return None
-    by_number = {int(fields[0]): (n, fields[1]) for n, fields in rows}
+    return _by_number({int(fields[0]): (n, fields[1]) for n, fields in rows}, pairs)
+
+
+def _by_number(
+    lines: Mapping[int, tuple[int, str]], pairs: ImagePairs
+) -> list[tuple[int, str]] | None:
+    """Return line and time of each pair from those of numbers, which are the images' or count
+    them; None: they are others.
+    """
     numbers = [_last_number(left) for left, _ in pairs]
-    if all(number in by_number for number in numbers):
-        return [by_number[int(number)] for number in numbers]
-    counted = sorted(by_number) == list(range(min(by_number), min(by_number) + len(pairs)))
-    return [by_number[k] for k in sorted(by_number)] if counted else None
+    if all(number in lines for number in numbers):
+        return [lines[int(number)] for number in numbers]
+    counted = sorted(lines) == list(range(min(lines), min(lines) + len(pairs)))
+    return [lines[k] for k in sorted(lines)] if counted else None
 
 
 def _of_all_images(
@@ -406,9 +459,14 @@ def time_lines(file: Path) -> tuple[list[tuple[int, list[str]]], str | None]:
             above.append(text.lstrip("#% "))
         else:
             rows.append((number, fields))
+    stated = _unit_stated_in(above)
     # nanoseconds have no decimals: such a comment is of something else
     decimals = any(re.search(r"\.\d*[1-9]", fields[:2][-1]) for _, fields in rows)
-    cells = [cell for text in above for cell in re.split(r"[,;\t]|\s(?=[A-Za-z])", text)]
-    stated = next((unit for cell in cells if (unit := time_unit(cell)) is not None), None)
-    stated = time_unit_in_words(above) if stated is None else stated
     return rows, None if stated == "ns" and decimals else stated
+
+
+def _unit_stated_in(texts: Sequence[str]) -> str | None:
+    """Return the unit of times that comments or headers state in a cell, else in words."""
+    cells = [cell for text in texts for cell in re.split(r"[,;\t]|\s(?=[A-Za-z])", text)]
+    units = (unit for cell in cells if (unit := time_unit(cell)) is not None)
+    return next(units, None) or time_unit_in_words(texts)

@@ -187,15 +187,23 @@ def _decoded(data: bytes, path: Path | str, *, colour: bool) -> npt.NDArray[Any]
         raise UnreadableImageError(
             f"{path}: does not decode as an image of 8 or 16 bits; copy the image again"
         )
-    if pixels.ndim == 3:
-        codes = (
-            (cv2.COLOR_BGR2RGB, cv2.COLOR_BGRA2RGB)
-            if colour
-            else (cv2.COLOR_BGR2GRAY, cv2.COLOR_BGRA2GRAY)
-        )
-        code = {1: None, 3: codes[0], 4: codes[1]}[pixels.shape[2]]
-        pixels = pixels[..., 0] if code is None else cv2.cvtColor(pixels, code)
-    return np.asarray(pixels)
+    return np.asarray(_in_channels(pixels, colour=colour))
+
+
+def _in_channels(pixels: npt.NDArray[Any], *, colour: bool) -> npt.NDArray[Any]:
+    """Return decoded pixels as RGB (H, W, 3) or gray (H, W); gray ones stay gray."""
+    import cv2
+
+    if pixels.ndim != 3:
+        return pixels
+    channels = pixels.shape[2]
+    if channels == 1:
+        return pixels[..., 0]
+    if colour:
+        code = {3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}[channels]
+    else:
+        code = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}[channels]
+    return cv2.cvtColor(pixels, code)
 
 
 def load_depth(path: Path) -> FloatArray:
@@ -386,22 +394,27 @@ def other_damage(data: bytes) -> str | None:
     read.
     """
     if data.startswith(b"BM") and len(data) >= 6:
-        return "the BMP is truncated" if struct.unpack_from("<I", data, 2)[0] > len(data) else None
+        return "the BMP is truncated" if _size_at(data, 2) > len(data) else None
     if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-        return (
-            "the WebP is truncated"
-            if struct.unpack_from("<I", data, 4)[0] + 8 > len(data)
-            else None
-        )
+        return "the WebP is truncated" if _size_at(data, 4) + 8 > len(data) else None
     if data[:2] in (b"P5", b"P6"):
-        header = re.match(
-            rb"P[56]\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s", data
-        )
-        if header is None:
-            return "the PGM or PPM has no valid header"
-        width, height, top = (int(x) for x in header.groups())
-        size = width * height * (3 if data[:2] == b"P6" else 1) * (2 if top > 255 else 1)
-        return "the PGM or PPM is truncated" if len(data) - header.end() < size else None
+        return _netpbm_damage(data)
     if data.startswith(_TIFF_STARTS):
         return None
     return "neither PNG nor JPEG, BMP, TIFF, PGM, PPM or WebP"
+
+
+def _size_at(data: bytes, offset: int) -> int:
+    """Return the size that a header states, in bytes."""
+    (size,) = struct.unpack_from("<I", data, offset)
+    return int(size)
+
+
+def _netpbm_damage(data: bytes) -> str | None:
+    """Describe the damage of a PGM or PPM image; None: it is complete."""
+    header = re.match(rb"P[56]\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s", data)
+    if header is None:
+        return "the PGM or PPM has no valid header"
+    width, height, top = (int(x) for x in header.groups())
+    size = width * height * (3 if data[:2] == b"P6" else 1) * (2 if top > 255 else 1)
+    return "the PGM or PPM is truncated" if len(data) - header.end() < size else None

@@ -285,6 +285,15 @@ def _checked(arrays: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.nd
             f"{path}: an observation log of version {version}, this program reads up to {VERSION}; "
             "upgrade stereo-vio"
         )
+    _check_arrays(arrays, path)
+    whole = _with_defaults(arrays)
+    if problem := _inconsistency(whole):
+        raise DataError(f"{path}: the observation log is inconsistent: {problem}; write it again")
+    return whole
+
+
+def _check_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
+    """Raise DataError where an array is missing, or has another type or other dimensions."""
     for key in _REQUIRED:
         if key not in arrays:
             raise DataError(f"{path}: the observation log lacks {key}; write it again")
@@ -294,10 +303,6 @@ def _checked(arrays: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.nd
                 f"{path}: {key} of the observation log has type {arrays[key].dtype}, "
                 f"{arrays[key].ndim}-D"
             )
-    whole = _with_defaults(arrays)
-    if problem := _inconsistency(whole):
-        raise DataError(f"{path}: the observation log is inconsistent: {problem}; write it again")
-    return whole
 
 
 def _with_defaults(arrays: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
@@ -333,18 +338,10 @@ def _of_rows(arrays: Mapping[str, np.ndarray]) -> str | None:
     rows = len(arrays["ids"])
     offsets = arrays["offsets"]
     frames = arrays["frame_indices"]
-    if (
-        arrays["z"].shape != (rows, 4)
-        or len(arrays["has_right"]) != rows
-        or len(arrays["stale"]) != rows
-    ):
+    if arrays["z"].shape != (rows, 4) or {len(arrays["has_right"]), len(arrays["stale"])} != {rows}:
         return f"{rows} ids, but z is {arrays['z'].shape} with {len(arrays['stale'])} stale marks"
-    if (
-        len(offsets) != len(frames) + 1
-        or offsets[0] != 0
-        or offsets[-1] != rows
-        or (np.diff(offsets) < 0).any()
-    ):
+    ends_fit = len(offsets) == len(frames) + 1 and offsets[0] == 0 and offsets[-1] == rows
+    if not ends_fit or (np.diff(offsets) < 0).any():
         return f"the offsets do not split {rows} rows into {len(frames)} frames"
     in_frame = np.stack([arrays["ids"], np.repeat(np.arange(len(frames)), np.diff(offsets))])
     in_order = in_frame[:, np.lexsort(in_frame)]

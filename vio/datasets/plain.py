@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from vio.dataclass import dataclass
 from vio.datasets import rigs
 from vio.datasets.companions import (
     IMU_FILES,
+    ReadImages,
     calibration_beside,
     find_calibration_of,
     read_companions,
@@ -334,9 +335,8 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     reference = None if poses is None else _read_reference(poses, times_ns, T_left_cam0)
     used = [] if poses is None else [poses]
     times = times_ns, times_file
-    parts = read_companions(
-        "kitti", layout, (file, rig), settings, times, notes, used, reference=reference
-    )
+    read = ReadImages("kitti", layout, (file, rig), times, notes, used)
+    parts = read_companions(read, settings, reference)
     return ImageDataset(*parts, pairs, levels=levels)
 
 
@@ -377,9 +377,8 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
     else:
         times_ns = numbers * _DRIVE_NS
         notes = (f"{used[0]} is missing; times follow from the frame numbers at 10 Hz", *notes)
-    parts = read_companions(
-        "kitti_raw", layout, (file, rig), settings, (times_ns, used[0]), notes, used
-    )
+    read = ReadImages("kitti_raw", layout, (file, rig), (times_ns, used[0]), notes, used)
+    parts = read_companions(read, settings)
     return ImageDataset(*parts, pairs, levels=levels)
 
 
@@ -436,18 +435,9 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
     if images.side_by_side:
         size = (size[0] // 2, size[1])
         notes = (*notes, "each image holds the left and the right one side by side")
-    is_tum = images.listed_ns is not None
     used = list[Path]()
-    file = settings.calibration or (
-        calibration_beside(layout) if is_tum else find_calibration_of(layout)
-    )
-    if file is None:
-        file = layout.root / LISTS[0]
-        rig = published_camera(layout.root, size)
-    else:
-        rig = rigs.load_rig(file, image_size=size, cameras=2 if kind == "plain" else 1)
-        if is_tum and rig.depth_factor is None and file.name in BARE_NAMES:
-            rig = replace(rig, depth_factor=DEPTH_FACTOR)
+    is_tum = images.listed_ns is not None
+    file, rig = _file_and_rig(kind, layout, size, settings, is_tum=is_tum)
     depth_factor = 1.0
     if images.depths is not None:
         depth_factor, factor_notes = _depth_factor(rig, settings, layout.root)
@@ -459,17 +449,12 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
     else:
         times_ns = images.listed_ns
         times_file = layout.root / LISTS[0]
-    # EuRoC's list repeats the times that the images are named by
-    if kind != "plain" and times_file == layout.left:
-        used.append(layout.left.parent / "data.csv")
-    if times_file == layout.left.parent / "data.csv":
-        used.append(layout.right.parent / "data.csv")
+    used += _other_lists(kind, layout, times_file)
     times = (times_ns, times_file)
     notes = (*images.notes, *notes)
     has_depths = images.depths is not None
-    parts = read_companions(
-        kind, layout, (file, rig), settings, times, notes, used, has_depths=has_depths
-    )
+    read = ReadImages(kind, layout, (file, rig), times, notes, used, has_depths=has_depths)
+    parts = read_companions(read, settings)
     return ImageDataset(
         *parts,
         images.pairs,
@@ -479,6 +464,37 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
         depth_factor=depth_factor,
         side_by_side=images.side_by_side,
     )
+
+
+def _file_and_rig(
+    kind: str,
+    layout: Layout,
+    size: tuple[int, int],
+    settings: DatasetSettings,
+    *,
+    is_tum: bool,
+) -> tuple[Path, Rig]:
+    """Return the calibration of images of a size, and its file; the published one of a TUM
+    recording without a file.
+    """
+    file = settings.calibration or (
+        calibration_beside(layout) if is_tum else find_calibration_of(layout)
+    )
+    if file is None:
+        return layout.root / LISTS[0], published_camera(layout.root, size)
+    rig = rigs.load_rig(file, image_size=size, cameras=2 if kind == "plain" else 1)
+    if is_tum and rig.depth_factor is None and file.name in BARE_NAMES:
+        rig = replace(rig, depth_factor=DEPTH_FACTOR)
+    return file, rig
+
+
+def _other_lists(kind: str, layout: Layout, times_file: Path | None) -> Iterator[Path]:
+    """Yield the lists of EuRoC's form that repeat the times of the images."""
+    of_left = layout.left.parent / "data.csv"
+    if kind != "plain" and times_file == layout.left:
+        yield of_left
+    if times_file == of_left:
+        yield layout.right.parent / "data.csv"
 
 
 def _choose_cameras(path: Path, colour: bool | None) -> tuple[int, int]:

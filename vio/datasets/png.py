@@ -55,12 +55,7 @@ def decode_gray8(data: bytes) -> Image | None:
         if kind == b"IDAT":
             parts.append(data[at + 8 : at + 8 + length])
         elif kind == b"IHDR" and length == 13:
-            width, height, *form = struct.unpack_from(">IIBBBBB", data, at + 8)
-            size = (
-                (height, width)
-                if tuple(form) == _GRAY_8 and 0 < height * width <= MAX_PIXELS
-                else None
-            )
+            size = _size_of_gray_8(data, at + 8)
         elif kind == b"IEND":
             return None if size is None else _pixels(b"".join(parts), *size)
         elif kind not in _PASSED_OVER:
@@ -68,6 +63,14 @@ def decode_gray8(data: bytes) -> Image | None:
         if size is None:
             return None
         at += 12 + length
+    return None
+
+
+def _size_of_gray_8(data: bytes, at: int) -> tuple[int, int] | None:
+    """Return height and width of a header; None: of another form, empty or too large."""
+    width, height, *form = struct.unpack_from(">IIBBBBB", data, at)
+    if tuple(form) == _GRAY_8 and 0 < height * width <= MAX_PIXELS:
+        return height, width
     return None
 
 

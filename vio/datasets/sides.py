@@ -70,23 +70,31 @@ def split_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
     None: they are not of two cameras. A word for a side tells them apart, or the number of a
     camera (`frame01_cam0`); those of one side without the other are left out.
     """
-    sides: dict[tuple[str, ...], dict[str, str]] = {}
+    frames: dict[tuple[str, ...], dict[str, str]] = {}
     for name in names:
-        words = words_of(os.path.splitext(name)[0])
-        at = next((k for k in range(len(words)) if _side_at(words, k) is not None), None)
-        if at is None:
+        found = _frame_and_side(name)
+        if found is None:
             return None
-        side = _side_at(words, at)
-        assert side is not None
-        of_frame = sides.setdefault((*words[:at], "", *words[at + 1 :]), {})
-        if side in of_frame:
+        frame, side = found
+        sides = frames.setdefault(frame, {})
+        if side in sides:
             return None
-        of_frame[side] = name
-    pairs = [found for found in sides.values() if len(found) == 2]
+        sides[side] = name
+    pairs = [sides for sides in frames.values() if len(sides) == 2]
     alone = len(names) - 2 * len(pairs)
     if not pairs or alone > len(pairs):
         return None
     return [pair["left"] for pair in pairs], [pair["right"] for pair in pairs]
+
+
+def _frame_and_side(name: str) -> tuple[tuple[str, ...], str] | None:
+    """Return the words of an image's name but the first that names a side, and this side."""
+    words = words_of(os.path.splitext(name)[0])
+    for k in range(len(words)):
+        side = _side_at(words, k)
+        if side is not None:
+            return (*words[:k], "", *words[k + 1 :]), side
+    return None
 
 
 def _side_at(words: tuple[str, ...], k: int) -> str | None:

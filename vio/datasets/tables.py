@@ -5,6 +5,7 @@ ms, us or ns.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import re
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -140,29 +141,19 @@ def table_rows(
     Raises:
         DataError: the file cannot be read or is empty, or a line has another number of columns.
     """
-    header = list[str]()
-    named = ""  # the header, as it is written
-    unread = ""
+    above = _LinesAbove(columns, [] if comments is None else comments)
     is_data = False
-    lines = lines_of(path)
-    for number, line in lines:
-        text = line.strip()
-        fields = split_cells(text.lstrip("#"))
-        if not text or text.startswith("#") or (not is_data and not _NUMBER.fullmatch(fields[0])):
-            if header and text and not text.startswith("#"):
-                unread = f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a point)"
-            if not is_data and text:
-                cells = header_cells(text, columns)
-                if cells:
-                    header = _with_units(header, cells)
-                    named = text.lstrip("# ")
-                elif comments is not None:
-                    comments.append(text)
+    lines = ((number, line.strip()) for number, line in lines_of(path))
+    for number, text in lines:
+        if not is_data and above.take(number, text):
             continue
-        if text == named:  # again, in a file that another was appended to
+        if not text or text.startswith("#"):
             continue
+        if above.is_header(text):  # again, in a file that another was appended to
+            continue
+        fields = split_cells(text)
         if len(fields) != columns:
-            if cut is not None and is_data and len(fields) < columns and next(lines, None) is None:
+            if cut is not None and is_data and _is_cut(fields, columns, lines):
                 early = f"the last line ends too early ({len(fields)} of {columns} values)"
                 cut.append(f"{path}, line {number}: {early}; left out")
                 return
@@ -171,12 +162,49 @@ def table_rows(
             )
         if not is_data:
             is_data = True
-            yield 0, header
+            yield 0, above.header
         yield number, fields
     if not is_data:
         raise DataError(
-            f"{path}: holds no line of data ({form}){unread}; copy it again, or remove it"
+            f"{path}: holds no line of data ({form}){above.unread}; copy it again, or remove it"
         )
+
+
+def _is_cut(fields: Sequence[str], columns: int, further: Iterator[object]) -> bool:
+    """Tell whether a line is too short and no further one follows, which is taken."""
+    return len(fields) < columns and next(further, None) is None
+
+
+class _LinesAbove:
+    """The lines above the data of a table: its header, and comments."""
+
+    def __init__(self, columns: int, comments: list[str]) -> None:
+        self.header = list[str]()
+        self.unread = ""  # of a line of text below the header: why it is no data
+        self._named = ""  # the header, as it is written
+        self._columns = columns
+        self._comments = comments
+
+    def is_header(self, text: str) -> bool:
+        """Whether a line is the header."""
+        return text == self._named
+
+    def take(self, number: int, text: str) -> bool:
+        """Take a line, unless it is one of data; return whether it was taken."""
+        if not text:
+            return True
+        is_comment = text.startswith("#")
+        if not is_comment and _NUMBER.fullmatch(next(iter(split_cells(text)), "")):
+            return False
+        if self.header and not is_comment:
+            self.unread = f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a point)"
+        cells = header_cells(text, self._columns)
+        if cells:
+            self.header = _with_units(self.header, cells)
+            self._named = text.lstrip("# ")
+        else:
+            self._comments.append(text)
+        return True
 
 
 def _with_units(header: list[str], cells: list[str]) -> list[str]:
@@ -409,15 +437,15 @@ def _factor(
     if factor is None:
         factor = factor_in_words(table.comments, units)
     if factor is None:
-        unknown = [word for cell in cells if (word := unknown_unit(cell, units)) is not None]
+        word = next(filter(None, (unknown_unit(cell, units) for cell in cells)), None)
+        if word is None:
+            return 1.0, []
         note = (
-            f"{table.path}: doubtful: the unit {unknown[0]!r} of the {name} is not known; it is read "
+            f"{table.path}: doubtful: the unit {word!r} of the {name} is not known; it is read "
             f"as {si}; if it is another, all its readings are off by a factor: write it as "
             f"{' or '.join(list(units)[:1])}, {_OTHER_UNITS[si]}"
-            if unknown
-            else ""
         )
-        return 1.0, [note] if note else []
+        return 1.0, [note]
     if factor == 1.0:
         return 1.0, []
     note = f"{table.path}: the header states {_words(factor)}; the {name} is converted to {si}"
@@ -437,22 +465,26 @@ def _imu_order(table: NumberTable) -> Sequence[int] | None:
     """
     found: dict[tuple[str, str], list[int]] = {}
     for k, cell in enumerate(table.header[1:]):
-        letters = re.sub(r"[^a-z]", "", without_unit(cell)).replace("axis", "")
-        axis = next((c for c in reversed(letters) if c in "xyz"), "")
-        found.setdefault((_sensor(letters), axis), []).append(k)
+        found.setdefault(_sensor_and_axis(cell), []).append(k)
     if not any(kind and axis for kind, axis in found):
         return None
-    wanted = [(kind, axis) for kind in "wa" for axis in "xyz"]
-    others = set(found) - set(wanted)
-    may_have_others = len(table.header) > _IMU_COLUMNS
-    missing = any(len(found.get(key, ())) != 1 for key in wanted)
-    if missing or (others and not may_have_others):
+    wanted = list(itertools.product("wa", "xyz"))
+    counts = [len(found.get(key, ())) for key in wanted]
+    others = found.keys() - wanted if len(table.header) <= _IMU_COLUMNS else set()
+    if others or counts != [1] * len(wanted):
         raise DataError(
             f"{table.path}: the header {','.join(table.header)[:80]!r} does not name gyro and "
             "accel; write "
             "'timestamp [ns],wx,wy,wz,ax,ay,az', or no header for that order"
         )
     return [found[key][0] for key in wanted]
+
+
+def _sensor_and_axis(cell: str) -> tuple[str, str]:
+    """Return the sensor and the axis that a cell of a header names; empty where it names none."""
+    letters = re.sub(r"[^a-z]", "", without_unit(cell)).replace("axis", "")
+    axis = next((c for c in reversed(letters) if c in "xyz"), "")
+    return _sensor(letters), axis
 
 
 def _sensor(letters: str) -> str:

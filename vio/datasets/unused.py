@@ -61,18 +61,27 @@ def _kept(layout: Layout, used: Sequence[Path]) -> set[Path]:
 def _not_read(layout: Layout, kept: set[Path]) -> list[str]:
     """Return the names of what else lies in the folders of a recording."""
     images = [side for side in (layout.left, layout.right) if side.is_dir()]
-    folders = dict.fromkeys((layout.root, layout.base, *images, *(side.parent for side in images)))
+    within = (layout.base, *images, *(side.parent for side in images))
+    folders = [layout.root, *(f for f in within if layout.root in f.parents)]
     found = []
-    for folder in folders:
-        if folder != layout.root and layout.root not in folder.parents:
-            continue
-        with_images = folder in images
+    for folder in dict.fromkeys(folders):
         for child in sorted(folder.iterdir()):
-            is_image = with_images and child.suffix.lower() in SUFFIXES
-            silent = child.name.startswith(".") or _fits(child.name.lower(), _SILENT)
-            if not is_image and not silent and child.absolute() not in kept:
-                found.append(str(child.relative_to(layout.root)) + ("/" if child.is_dir() else ""))
+            expected = child.absolute() in kept or _is_silent(child, with_images=folder in images)
+            if not expected:
+                found.append(_name_in(layout.root, child))
     return found
+
+
+def _name_in(root: Path, child: Path) -> str:
+    """Return the path of a file, or of a folder with a slash behind, within a recording."""
+    return f"{child.relative_to(root)}{'/' if child.is_dir() else ''}"
+
+
+def _is_silent(child: Path, *, with_images: bool) -> bool:
+    """Tell whether nothing is said of a file: a hidden or a usual one, or an image among images."""
+    if with_images and child.suffix.lower() in SUFFIXES:
+        return True
+    return child.name.startswith(".") or _fits(child.name.lower(), _SILENT)
 
 
 def _fits(name: str, patterns: Sequence[str]) -> bool:

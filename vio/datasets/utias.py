@@ -9,8 +9,9 @@ from __future__ import annotations
 import errno
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -77,20 +78,35 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
 
 
 def _read_mat(path: Path) -> Mapping[str, FloatArray]:
+    shapes, raw = _arrays_of_mat(path)
+    _check_names(shapes, path)
+    wanted = [name for name in (*KEYS, *OPTIONAL_KEYS) if name in shapes]
+    for key in wanted:
+        if not isinstance(raw.get(key), np.ndarray) or raw[key].dtype.kind not in "fiu":
+            raise DataError(f"{path}: {key} is not an array of real numbers; save it again as one")
+    return {key: raw[key].astype(np.float64) for key in wanted}
+
+
+def _check_names(names: Iterable[str], path: Path) -> None:
+    """Raise DataError where a variable is missing among those of a file."""
+    held = sorted(name for name in names if not name.startswith("__"))
+    if missing := [key for key in KEYS if key not in held]:
+        raise DataError(
+            f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found "
+            f"{' '.join(held)}"
+        )
+
+
+def _arrays_of_mat(path: Path) -> tuple[dict[str, tuple[int, ...]], Mapping[str, Any]]:
+    """Return the shapes of all variables of a MATLAB file, and those that are read here.
+
+    Raises:
+        DataError: it cannot be read, or is damaged or too large.
+    """
     from scipy.io import loadmat, whosmat
     from scipy.io.matlab import MatReadError
 
-    try:
-        check_regular(path)
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, "it is a folder")
-        shapes = {name: shape for name, shape, _ in whosmat(path)}
-        wanted = [name for name in (*KEYS, *OPTIONAL_KEYS) if name in shapes]
-        check_array_bytes({name: 8 * math.prod(shapes[name]) for name in wanted}, path)
-        raw = loadmat(path, mat_dtype=True, variable_names=wanted)
-    except NotImplementedError as error:
-        raise DataError(f"{path}: a MATLAB 7.3 file; save it again with `save -v7`") from error
-    except (
+    damage = (
         MatReadError,
         ValueError,
         TypeError,
@@ -99,19 +115,21 @@ def _read_mat(path: Path) -> Mapping[str, FloatArray]:
         EOFError,
         MemoryError,
         zlib.error,
-    ) as error:
+    )
+    try:
+        check_regular(path)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        shapes = {name: shape for name, shape, _ in whosmat(path)}
+        wanted = [name for name in (*KEYS, *OPTIONAL_KEYS) if name in shapes]
+        check_array_bytes({name: 8 * math.prod(shapes[name]) for name in wanted}, path)
+        return shapes, loadmat(path, mat_dtype=True, variable_names=wanted)
+    except NotImplementedError as error:
+        raise DataError(f"{path}: a MATLAB 7.3 file; save it again with `save -v7`") from error
+    except damage as error:
         raise DataError(f"{path}: is damaged or no MATLAB file ({error}); copy it again") from error
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror or error}; copy it again") from error
-    if missing := [key for key in KEYS if key not in wanted]:
-        names = " ".join(sorted(name for name in shapes if not name.startswith("__")))
-        raise DataError(
-            f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found {names}"
-        )
-    for key in wanted:
-        if not isinstance(raw.get(key), np.ndarray) or raw[key].dtype.kind not in "fiu":
-            raise DataError(f"{path}: {key} is not an array of real numbers; save it again as one")
-    return {key: raw[key].astype(np.float64) for key in wanted}
 
 
 def _rows(

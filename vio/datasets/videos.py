@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from vio.datasets.companions import find_calibration_of, read_companions
+from vio.cameras.rig import Rig
+from vio.datasets.companions import ReadImages, find_calibration_of, read_companions
 from vio.datasets.image_pairs import ImageRecording, half_of
 from vio.datasets.image_times import times_of
 from vio.datasets.images import prefetch
@@ -98,19 +99,25 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     one = files[0] == files[1]
     size = (left.width // 2, left.height) if one else (left.width, left.height)
     rig = load_rig(file, image_size=size, cameras=2)
-    if one and (rig.cam0.width, rig.cam0.height) != size:
-        raise DataError(
-            f"{files[0]} is the only video, of {left.width} x {left.height} pixels, and {file} is "
-            f"for images of {rig.cam0.width} x {rig.cam0.height}; side by side they would have "
-            "twice that width; give left.mp4 and right.mp4, or the calibration of these images"
-        )
+    if one:
+        _check_side_by_side(rig, left, files[0], file)
     times_ns, times_file, rows, notes = _times(path, files, (left, right))
     if one:
         notes.append(f"{files[0].name} holds the left and the right image side by side")
-    parts = read_companions(
-        "video", layout, (file, rig), settings, (times_ns, times_file), notes, files
-    )
+    read = ReadImages("video", layout, (file, rig), (times_ns, times_file), notes, files)
+    parts = read_companions(read, settings)
     return VideoDataset(*parts, files, rows, imu_noise=rig.imu_noise)
+
+
+def _check_side_by_side(rig: Rig, video: _Facts, path: Path, calibration: Path) -> None:
+    """Raise DataError where a calibration is not of half the width of a single video."""
+    if (rig.cam0.width, rig.cam0.height) != (video.width // 2, video.height):
+        raise DataError(
+            f"{path} is the only video, of {video.width} x {video.height} pixels, and "
+            f"{calibration} is for images of {rig.cam0.width} x {rig.cam0.height}; side by side "
+            "they would have twice that width; give left.mp4 and right.mp4, or the calibration of "
+            "these images"
+        )
 
 
 def _facts(file: Path) -> _Facts:

@@ -220,21 +220,29 @@ def matrix(value: object, shape: tuple[int, int] | None, where: str) -> FloatArr
     Raises:
         CalibrationError: it holds other counts, or a value is not a finite number.
     """
-    stated: tuple[int, int] | None = None
-    if isinstance(value, dict):
-        rows = as_number(value.get("rows"))
-        cols = as_number(value.get("cols", value.get("columns")))
-        stated = (int(rows), int(cols)) if rows >= 1 and cols >= 1 else None
-        value = value.get("data")
-    if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
-        stated = stated or (len(value), len(value[0]))
-        value = [x for row in value for x in row]
-    found = np.array(
-        [as_number(x) for x in value] if isinstance(value, list) else [as_number(value)]
-    )
+    stated, values = _stated_shape(value)
+    found = np.array([as_number(x) for x in values])
     size = shape or stated or (1, len(found))
     if len(found) != size[0] * size[1] or not np.isfinite(found).all():
         raise CalibrationError(
             f"{where} holds {len(found)} values, expected {size[0]} x {size[1]} finite numbers"
         )
     return found.reshape(size)
+
+
+def _stated_shape(value: object) -> tuple[tuple[int, int] | None, list[Any]]:
+    """Return the rows and columns that an entry states (None: it does not), and its values in one
+    list.
+    """
+    stated: tuple[int, int] | None = None
+    if isinstance(value, dict):
+        rows = as_number(value.get("rows"))
+        cols = as_number(value.get("cols", value.get("columns")))
+        if min(rows, cols) >= 1:
+            stated = (int(rows), int(cols))
+        value = value.get("data")
+    if not isinstance(value, list):
+        return stated, [value]
+    if value and all(isinstance(row, list) for row in value):
+        return stated or (len(value), len(value[0])), [x for row in value for x in row]
+    return stated, value

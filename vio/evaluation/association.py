@@ -46,17 +46,9 @@ def associate(
             f"cannot compare {len(estimate)} estimated poses with {len(reference)} reference poses"
         )
     if estimate.times_ns is not None and reference.times_ns is not None:
-        if not 0 <= max_time_difference_s <= _LONGEST_S:
-            limit = f"the largest time difference is 0 to {_LONGEST_S:g} s"
-            raise EvaluationError(f"{limit}, got {max_time_difference_s:g} s")
-        most_ns = round(max_time_difference_s * NS_PER_S)
-        rows, reference_rows = associate_times(
-            estimate.times_ns, reference.times_ns, max_difference_ns=most_ns
+        rows, reference_rows = _by_time(
+            estimate.times_ns, reference.times_ns, max_time_difference_s
         )
-        if len(rows) == 0:
-            raise EvaluationError(
-                _no_common_time(estimate.times_ns, reference.times_ns, max_time_difference_s)
-            )
         return "time", rows, reference_rows
     if (
         reference.times_ns is not None
@@ -79,6 +71,24 @@ def associate(
             f"{reference_frames[0]} to {reference_frames[-1]}; give the reference of this recording"
         )
     return "frame", rows.astype(np.int64), reference_rows.astype(np.int64)
+
+
+def _by_time(
+    times_ns: IntArray, reference_ns: IntArray, max_difference_s: float
+) -> tuple[IntArray, IntArray]:
+    """Return the rows of poses at the same times, at least one.
+
+    Raises:
+        EvaluationError: there is none, or the largest difference is no usable number.
+    """
+    if not 0 <= max_difference_s <= _LONGEST_S:
+        limit = f"the largest time difference is 0 to {_LONGEST_S:g} s"
+        raise EvaluationError(f"{limit}, got {max_difference_s:g} s")
+    most_ns = round(max_difference_s * NS_PER_S)
+    rows, reference_rows = associate_times(times_ns, reference_ns, max_difference_ns=most_ns)
+    if len(rows) == 0:
+        raise EvaluationError(_no_common_time(times_ns, reference_ns, max_difference_s))
+    return rows, reference_rows
 
 
 def associate_times(

@@ -35,9 +35,10 @@ def settled_orders(
         reference: likewise.
         max_time_difference_s: poses further apart in time are not compared.
     """
+    given = {"estimate": estimate, "reference": reference}
     assumed = {
         name: _exchanged(trajectory)
-        for name, trajectory in (("estimate", estimate), ("reference", reference))
+        for name, trajectory in given.items()
         if trajectory.orientations.endswith("assumed")
     }
     if not assumed or "none" in (estimate.orientations, reference.orientations):
@@ -46,18 +47,26 @@ def settled_orders(
     if as_read is None or as_read < _LARGE_DEG:
         return estimate, reference, ()
     for name, exchanged in assumed.items():
-        pair = (exchanged, reference) if name == "estimate" else (estimate, exchanged)
-        spread = _spread_deg(*pair, max_time_difference_s)
+        pair = given | {name: exchanged}
+        spread = _spread_deg(pair["estimate"], pair["reference"], max_time_difference_s)
         if spread is not None and _BETTER * spread < as_read:
-            read = "first" if exchanged.orientations == "w first, assumed" else "last"
-            other = "last" if read == "first" else "first"
-            note = (
-                f"the {name} does not state the order of its quaternions: they are read with w "
-                f"{read}, which leaves {spread:.2g} deg between the attitudes, and w {other} would "
-                f"leave {as_read:.0f} deg; name the columns in its header (qx,qy,qz,qw)"
+            return (
+                pair["estimate"],
+                pair["reference"],
+                (_exchange_note(name, exchanged, spread, as_read),),
             )
-            return *pair, (note,)
     return estimate, reference, ()
+
+
+def _exchange_note(name: str, exchanged: Trajectory, spread: float, as_read: float) -> str:
+    """Return what is said of a trajectory read in the other order, with both spreads in deg."""
+    read = "first" if exchanged.orientations == "w first, assumed" else "last"
+    other = "last" if read == "first" else "first"
+    return (
+        f"the {name} does not state the order of its quaternions: they are read with w "
+        f"{read}, which leaves {spread:.2g} deg between the attitudes, and w {other} would "
+        f"leave {as_read:.0f} deg; name the columns in its header (qx,qy,qz,qw)"
+    )
 
 
 def _exchanged(trajectory: Trajectory) -> Trajectory:

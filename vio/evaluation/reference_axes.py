@@ -85,12 +85,12 @@ def attitude_note(
             np.swapaxes(R_ref, 1, 2) @ R_align @ with_other_order(R_raw, order)
         )
     left = {key: _spread_deg(differences) for key, differences in others.items()}
-    best = min(left, key=lambda key: left[key])
+    best = min(left.values())
     of_body = _spread_deg(body)
-    if min(of_body, left[best]) > _RULES.constant * off_deg:
+    if min(of_body, best) > _RULES.constant * off_deg:
         return f"{head}, and no exchange of axes explains it; check what the reference's orientations mean"
-    if _BETTER * left[best] < of_body:
-        alike = [key for key in left if left[key] <= left[best] + _RULES.alike_deg]
+    if _BETTER * best < of_body:
+        alike = [key for key in left if left[key] <= best + _RULES.alike_deg]
         causes = ", or ".join(f"the {whose}'s orientations are {words}" for whose, words in alike)
         return f"{head}: {causes}{_NO_MEASURE}; correct the file it was written from"
     return (

@@ -156,7 +156,7 @@ def _unit_of(
     """Return the unit by size; where that makes the entries too close or too far, that by pace."""
     size = values[0].copy_abs()
     by_size: TimeUnit = next((unit for unit, least in _SIZES if size >= least), "s")
-    if pace is None or len(values) < 2 or any(value.copy_abs() > INT64_MAX for value in values):
+    if pace is None or len(values) < 2 or max(map(Decimal.copy_abs, values)) > INT64_MAX:
         return by_size
     mean = float(values[-1] - values[0]) / (len(values) - 1)
     if pace.believes(mean * _seconds(by_size)):
@@ -165,17 +165,18 @@ def _unit_of(
     if pace.believes(step * _seconds(by_size)):
         return by_size
     by_pace = _unit_by_pace(step, values[-1], pace)
-    if by_pace is None:
-        return by_size
-    if doubts is not None:
-        apart = step * _seconds(by_pace)
-        other = step * _seconds(by_size)
-        doubts.append(
-            f"{where(0)}: its times are taken for {_NAMES[by_pace]} ({pace.what} {apart:.4g} s "
-            f"apart), as they would be {other:.4g} s apart in {_NAMES[by_size]}; if that is wrong, "
-            "state the unit in a header, as '# time [s]'"
-        )
-    return by_pace
+    if by_pace is not None and doubts is not None:
+        doubts.append(_doubt(where(0), pace, step, by_pace, by_size))
+    return by_pace or by_size
+
+
+def _doubt(place: str, pace: Pace, step: float, taken: TimeUnit, other: TimeUnit) -> str:
+    """Return what is said of stamps whose unit was taken by their median step."""
+    return (
+        f"{place}: its times are taken for {_NAMES[taken]} ({pace.what} "
+        f"{step * _seconds(taken):.4g} s apart), as they would be {step * _seconds(other):.4g} s "
+        f"apart in {_NAMES[other]}; if that is wrong, state the unit in a header, as '# time [s]'"
+    )
 
 
 def _unit_by_pace(step: float, last: Decimal, pace: Pace) -> TimeUnit | None:

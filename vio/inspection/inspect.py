@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from vio.datasets.samples import motion_samples
 from vio.findings import Finding
 from vio.geometry.rectify import field_of_view
+from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import late_text
 from vio.imu.clocks import judge_clocks
 from vio.imu.findings import InertialFinding
@@ -83,32 +85,30 @@ def _frames_to_track(recording: Recording, times_ns: IntArray, tracked: int) -> 
 def camera_part(recording: Recording) -> Part:
     """Describe the rectified pair, or the undistorted camera."""
     c = recording.camera
-    stereo = c.kind == "stereo"
     facts: dict[str, object] = {"kind": c.kind, "fu": c.fu, "fv": c.fv, "cu": c.cu, "cv": c.cv}
-    facts |= {"baseline_m": c.baseline_m} if stereo else {}
+    if c.kind == "stereo":
+        facts["baseline_m"] = c.baseline_m
     facts |= {"width": c.width or 0, "height": c.height or 0}
-    known = c.width is not None and c.height is not None
-    wide = " x ".join(f"{angle:.0f}" for angle in np.degrees(field_of_view(c))) if known else ""
-    wide = f", {wide} deg" if known else ""
-    faults = []
-    if c.baseline_fault is not None:
-        faults.append(c.baseline_fault)
-    if (
-        c.width is not None
-        and c.height is not None
-        and not (0 < c.cu < c.width and 0 < c.cv < c.height)
-    ):
-        faults.append(
-            f"the principal point {c.cu:.0f}, {c.cv:.0f} is outside the image; check its size"
-        )
-    if stereo:
-        form = " to a cylinder" if c.is_cylinder else ""
-        far = f"disparity 1 px at a depth of {c.fu * c.baseline_m:.0f} m"
-        text = f"rectified{form}: focal {c.fu:.1f} px{wide}, baseline {c.baseline_m:.4f} m, {far}"
-    else:
+    wide = ""
+    faults = [] if c.baseline_fault is None else [c.baseline_fault]
+    if c.width is not None and c.height is not None:
+        angles = " x ".join(f"{angle:.0f}" for angle in np.degrees(field_of_view(c)))
+        wide = f", {angles} deg"
+        if not (0 < c.cu < c.width and 0 < c.cv < c.height):
+            faults.append(
+                f"the principal point {c.cu:.0f}, {c.cv:.0f} is outside the image; check its size"
+            )
+    return Part("camera", _camera_text(c, wide), facts, faults)
+
+
+def _camera_text(c: StereoCamera, wide: str) -> str:
+    """Return kind, focal length, field of view as given, and baseline of a camera in words."""
+    if c.kind != "stereo":
         beside = "with depth images" if c.kind == "rgbd" else "alone"
-        text = f"one camera {beside}, undistorted: focal {c.fu:.1f} px{wide}"
-    return Part("camera", text, facts, faults)
+        return f"one camera {beside}, undistorted: focal {c.fu:.1f} px{wide}"
+    form = " to a cylinder" if c.is_cylinder else ""
+    far = f"disparity 1 px at a depth of {c.fu * c.baseline_m:.0f} m"
+    return f"rectified{form}: focal {c.fu:.1f} px{wide}, baseline {c.baseline_m:.4f} m, {far}"
 
 
 def _spread(
@@ -130,12 +130,10 @@ def _motion_parts(dataset: Dataset, span: tuple[int, int | None], times_ns: IntA
     """Describe the samples of velocity sensor and IMU beside frames at some times."""
     recording = dataset.recording
     events = list(dataset.events(*span, images=False))
+    parts = list[Part]()
     velocities = [event.time_ns for event in events if isinstance(event, VelocitySample)]
-    parts = (
-        [clock_part("velocity", times_ns, np.array(velocities, dtype=np.int64))]
-        if velocities
-        else []
-    )
+    if velocities:
+        parts.append(clock_part("velocity", times_ns, np.array(velocities, dtype=np.int64)))
     samples = [event for event in events if isinstance(event, ImuSample)]
     if not samples:
         return parts
@@ -145,7 +143,7 @@ def _motion_parts(dataset: Dataset, span: tuple[int, int | None], times_ns: IntA
     parts.append(clock_part("IMU", times_ns, record.times_ns, rate_hz))
     if len(samples) > 1:
         noise = noise_part(record, getattr(dataset, "imu_noise", None))
-        parts += [rest_part(record, recording.T_cam0_imu), *([noise] if noise is not None else [])]
+        parts += filter(None, (rest_part(record, recording.T_cam0_imu), noise))
     if recording.T_cam0_imu is not None:
         parts.append(extrinsics_part(recording.T_cam0_imu))
     return parts
@@ -159,55 +157,77 @@ def _tracking_parts(
 ) -> list[Part]:
     """Track some frames, and compare the IMU with the images' motion as a run does."""
     recording = dataset.recording
-    frontend = build_frontend(dataset)
-    imu = "imu" in recording.motion and recording.T_cam0_imu is not None
-    check = (
-        InertialCheck(recording.camera, recording.T_cam0_imu)
-        if recording.T_cam0_imu is not None
-        else None
-    )
-    tracked: list[int] = []
-    matched: list[int] = []
-    findings: list[str] = []
-    shifted: list[str] = []
     mono = recording.camera.kind == "mono"
+    seen = _track(dataset, build_frontend(dataset), frames, progress)
+    parts = [_tracked_part(seen, mono=mono)]
+    if seen.shifted:
+        parts.append(Part("pairs", "of different times", {"shifted": True}, seen.shifted))
+    if "imu" in recording.motion and recording.T_cam0_imu is not None:
+        parts.append(_imu_part(seen.imu_findings, mono=mono))
+    return parts
+
+
+@dataclass(slots=True)
+class _Tracked:
+    """What tracking some frames has shown."""
+
+    tracked: list[int] = field(default_factory=list)  # features from the frame before, per frame
+    matched: list[int] = field(default_factory=list)  # features with depth, per frame
+    shifted: list[str] = field(default_factory=list)  # findings about the pairs
+    imu_findings: list[str] = field(default_factory=list)
+
+
+def _track(
+    dataset: Dataset, frontend: Frontend, frames: range, progress: Callable[[int, int], None]
+) -> _Tracked:
+    """Track some frames, and give their motion and the samples between them to a check."""
+    recording = dataset.recording
+    mono = recording.camera.kind == "mono"
+    check: InertialCheck | None = None
+    if "imu" in recording.motion and recording.T_cam0_imu is not None:
+        check = InertialCheck(recording.camera, recording.T_cam0_imu)
+    seen = _Tracked()
     for event in dataset.events(frames.start, frames.stop):
         if isinstance(event, StereoFrame):
             output = frontend.process(event)
-            tracked.append(output.tracked)
-            matched.append(output.matched)
-            shifted += [_shifted_text(f) for f in output.findings if f.code == "pairs-shifted"]
-            progress(len(tracked), len(frames))
-            if imu and check is not None:
-                findings += _messages(check.frame(output.observations), mono=mono)
-        elif isinstance(event, ImuSample) and check is not None:
+            seen.tracked.append(output.tracked)
+            seen.matched.append(output.matched)
+            seen.shifted += [_shifted_text(f) for f in output.findings if f.code == "pairs-shifted"]
+            progress(len(seen.tracked), len(frames))
+            if check is not None:
+                seen.imu_findings += _messages(check.frame(output.observations), mono=mono)
+        elif check is not None and isinstance(event, ImuSample):
             check.imu([event])
-    if imu and check is not None:
-        findings += _messages(check.finish(), mono=mono)
-    kept = float(np.median(tracked[1:])) if len(tracked) > 1 else 0.0
-    facts = {
-        "frames": len(tracked),
-        "tracked_median": kept,
-        "matched_median": float(np.median(matched or [0])),
-    }
-    depth = "" if mono else f", {np.median(matched or [0]):.0f} with depth"
-    text = f"{kept:.0f} features from frame to frame{depth} (of {len(tracked)} frames)"
+    if check is not None:
+        seen.imu_findings += _messages(check.finish(), mono=mono)
+    return seen
+
+
+def _tracked_part(seen: _Tracked, *, mono: bool) -> Part:
+    """Describe how many features were tracked."""
+    count = len(seen.tracked)
+    kept = float(np.median(seen.tracked[1:])) if count > 1 else 0.0
+    matched = float(np.median(seen.matched or [0]))
+    facts = {"frames": count, "tracked_median": kept, "matched_median": matched}
+    depth = "" if mono else f", {matched:.0f} with depth"
+    text = f"{kept:.0f} features from frame to frame{depth} (of {count} frames)"
     faults = []
-    if len(tracked) > 1 and kept < 8:
+    if count > 1 and kept < 8:
         faults.append(
             "hardly any feature is tracked; the frames may not be consecutive, in disorder, dark "
             "or blurred"
         )
-    parts = [Part("tracking", text, facts, faults)]
-    if shifted:
-        parts.append(Part("pairs", "of different times", {"shifted": True}, shifted))
-    if imu:
-        verdict = "agrees with the motion of the images, as far as they move"
-        if mono:
-            verdict = "not compared: the motion of one camera has no scale"
-        verdict = "see below" if findings else verdict
-        parts.append(Part("IMU against images", verdict, {"findings": findings}, findings))
-    return parts
+    return Part("tracking", text, facts, faults)
+
+
+def _imu_part(findings: Sequence[str], *, mono: bool) -> Part:
+    """Describe how the IMU fits the motion of the images."""
+    verdict = "agrees with the motion of the images, as far as they move"
+    if mono:
+        verdict = "not compared: the motion of one camera has no scale"
+    if findings:
+        verdict = "see below"
+    return Part("IMU against images", verdict, {"findings": findings}, findings)
 
 
 def _shifted_text(found: Finding) -> str:

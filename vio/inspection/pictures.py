@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -72,7 +72,7 @@ def images_part(frames: Sequence[StereoFrame]) -> Part:
             "images", "none could be read", {}, ["no image could be read; see the warnings above"]
         )
     cameras = len(shown[0])
-    found = [[gray_levels_of(image) for image in side] for side in zip(*shown, strict=True)]
+    found = [list(map(gray_levels_of, side)) for side in zip(*shown, strict=True)]
     means = [float(np.mean([e.mean for e in side])) for side in found]
     clipped = max(e.clipped for side in found for e in side)
     sharpness = float(np.median([e.sharpness for side in found for e in side]))
@@ -164,21 +164,11 @@ def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
     matches = [
         sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None
     ]
-    counts = [len(z) for z in matches]
+    counts = list(map(len, matches))
     z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _PICTURES.min_matches)])
-    image = next((f.left for f in frames if f.left is not None), None)
-    size = (1.0, 1.0) if image is None else (float(image.shape[1]), float(image.shape[0]))
-    found = row_residuals(z, *size)
+    found = row_residuals(z, *_size_of_images(frames))
     if isinstance(found, NotObservable):
-        fault = (
-            f"only {max(counts, default=0)} points match between left and right; check that the "
-            "folders are of one "
-            "stereo camera, its lenses clean and in focus"
-        )
-        hopeless = max(counts, default=0) < _PICTURES.min_matches
-        return [
-            Part("stereo", str(found), {"matches": int(sum(counts))}, [fault] if hopeless else [])
-        ]
+        return [_unmatched_part(found, counts)]
     off = StereoError(found.rms_px, found.disparity_px)
     faults = _rows_faults(found)
     if faults and (turn_deg := _turn_between(frames)):
@@ -190,6 +180,24 @@ def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
         Part("stereo", _rows_text(found, counts), _rows_facts(found), faults),
         Part("calibration", str(off), {"grade": off.grade, "rows_rms_px": off.rows_px}),
     ]
+
+
+def _size_of_images(frames: Sequence[StereoFrame]) -> tuple[float, float]:
+    """Return width and height of the first left image in px; 1, 1: there is none."""
+    image = next((f.left for f in frames if f.left is not None), None)
+    return (1.0, 1.0) if image is None else (float(image.shape[1]), float(image.shape[0]))
+
+
+def _unmatched_part(why: NotObservable, counts: Sequence[int]) -> Part:
+    """Describe images whose rows cannot be compared, with the matches of each pair."""
+    most = max(counts, default=0)
+    faults = []
+    if most < _PICTURES.min_matches:
+        faults.append(
+            f"only {most} points match between left and right; check that the folders are of one "
+            "stereo camera, its lenses clean and in focus"
+        )
+    return Part("stereo", str(why), {"matches": int(sum(counts))}, faults)
 
 
 def _rows_text(found: RowResiduals, counts: Sequence[int]) -> str:
@@ -231,6 +239,11 @@ def _rows_faults(found: RowResiduals) -> list[str]:
     return []
 
 
+def _is_distinct(nearest: Sequence[Any]) -> bool:
+    """Tell whether the nearest of two descriptors is by far nearer than the other."""
+    return len(nearest) == 2 and nearest[0].distance < _PICTURES.ratio * nearest[1].distance
+
+
 def _turn_between(frames: Sequence[StereoFrame]) -> int:
     """Return by how many quarter turns, in degrees, the points of right images are turned against
     those of the left ones; 0: by none, or it is not known.
@@ -265,7 +278,7 @@ def sift_points(left: Image, right: Image) -> list[tuple[cv2.KeyPoint, cv2.KeyPo
     return [
         (points0[m[0].queryIdx], points1[m[0].trainIdx])
         for m in matcher.knnMatch(first, second, k=2)
-        if len(m) == 2 and m[0].distance < _PICTURES.ratio * m[1].distance
+        if _is_distinct(m)
     ]
 
 

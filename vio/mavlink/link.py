@@ -104,14 +104,13 @@ def open_link(address: str) -> Link:
         VioError: it cannot be opened.
     """
     kind, _, rest = address.partition(":")
-    if kind == "udp":
-        host, _, port = rest.rpartition(":")
-        if host and port.isdigit() and 0 < int(port) < 2**16:
-            return UdpLink(host, int(port))
-    elif kind == "serial" and rest:
-        device, _, baud = rest.rpartition(":")
-        if device and baud.isdigit() and int(baud):
-            return SerialLink(device, int(baud))
-        if not device:
+    place, _, text = rest.rpartition(":")
+    number = int(text) if text.isdigit() else 0
+    if kind == "udp" and place and 0 < number < 2**16:
+        return UdpLink(place, number)
+    if kind == "serial" and rest:
+        if not place:
             return SerialLink(rest, _BAUD)
+        if number:
+            return SerialLink(place, number)
     raise ConfigError(f"--mavlink {address}: {_FORMS}")

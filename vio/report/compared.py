@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from vio.geometry.lie import FloatArray, se3_from_parts
 from vio.report.words import run_figures, smaller_is_better
 from vio.runs.finished import FinishedRun
 
+_Value = TypeVar("_Value")
 _MIN_FRAMES = 3  # in common, for an alignment
 
 
@@ -56,21 +58,32 @@ def compared_figures(runs: Sequence[FinishedRun]) -> dict[str, list[tuple[str, b
     Figures of different recordings are not compared.
     """
     columns = [run_figures(run) for run in runs]
-    rows = {name: [(column[name], False) for column in columns] for name in columns[0]}
-    if len(runs) < 2 or len({str(run.metrics.get("source")) for run in runs}) > 1:
-        return rows
-    numbers = [smaller_is_better(run) for run in runs]
-    for name in numbers[0]:
-        values = [column[name] for column in numbers]
-        known = [value for value in values if value is not None]
-        if len(known) < 2:
-            continue
-        best = min(known)
-        rows[name] = [
-            (text + _change(values[0], value), value == best != max(known))
-            for (text, _), value in zip(rows[name], values, strict=True)
-        ]
+    rows = {name: [(text, False) for text in _cells(columns, name)] for name in columns[0]}
+    sources = {str(run.metrics.get("source")) for run in runs}
+    if len(runs) > 1 and len(sources) == 1:
+        numbers = [smaller_is_better(run) for run in runs]
+        for name in numbers[0]:
+            rows[name] = _with_changes(_cells(columns, name), _cells(numbers, name))
     return rows
+
+
+def _cells(columns: Sequence[Mapping[str, _Value]], name: str) -> list[_Value]:
+    """Return a row of a table that is given by columns."""
+    return [column[name] for column in columns]
+
+
+def _with_changes(texts: Sequence[str], values: Sequence[float | None]) -> list[tuple[str, bool]]:
+    """Return the texts of one figure with the changes from the first value, and which is the
+    smallest; where less than two are known, neither.
+    """
+    known = [value for value in values if value is not None]
+    if len(known) < 2:
+        return [(text, False) for text in texts]
+    best = min(known)
+    return [
+        (text + _change(values[0], value), value == best != max(known))
+        for text, value in zip(texts, values, strict=True)
+    ]
 
 
 def _change(first: float | None, value: float | None) -> str:

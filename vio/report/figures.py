@@ -151,15 +151,17 @@ def _path_3d(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSec
     figure.add_trace(
         go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, **_named(figure, "landmarks"))
     )
+    figure.update_layout(height=620, scene=_equal_scales(high - low))
+    return ReportSection("Path in three dimensions", figure, "Turn it with the mouse.")
+
+
+def _equal_scales(span: FloatArray) -> dict[str, Any]:
+    """Return the scene of a plot in three dimensions that shows a span (3,) in m."""
     axes = {
         f"{name}axis": {"title": f"{axis} (m)"} for name, axis in zip("xyz", _AXES, strict=True)
     }
-    ratio = dict(
-        zip("xyz", (_LONGEST_SIDE * (high - low) / (high - low).max()).tolist(), strict=True)
-    )
-    scene = {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": {"eye": _EYE}}
-    figure.update_layout(height=620, scene=scene)
-    return ReportSection("Path in three dimensions", figure, "Turn it with the mouse.")
+    ratio = dict(zip("xyz", (_LONGEST_SIDE * span / span.max()).tolist(), strict=True))
+    return {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": {"eye": _EYE}}
 
 
 def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[ReportSection]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from vio.files.atomic import atomic_write_text
@@ -100,20 +100,29 @@ def _key_figures(runs: Sequence[FinishedRun]) -> str:
     found = compared_figures(runs)
     names = [run.name for run in runs]
     rows = {name: [text for text, _ in cells] for name, cells in found.items()}
-    best = {
+    if len(runs) == 1:
+        return table("Figures", names, rows)
+    best = _best_cells(found)
+    distances = _distances(runs)
+    if any(distances):
+        rows[f"distance from {runs[0].name}"] = ["–", *(text or "–" for text in distances)]
+    remark = f"In brackets the change from {runs[0].name}; bold: the best." if best else ""
+    return table("Figures", names, rows, best, remark)
+
+
+def _distances(runs: Sequence[FinishedRun]) -> list[str]:
+    """Return how far each other run is from the first, as text; empty: they are not comparable."""
+    return [str(apart(runs[0], run) or "") for run in runs[1:]]
+
+
+def _best_cells(figures: Mapping[str, Sequence[tuple[str, bool]]]) -> set[tuple[str, int]]:
+    """Return row and column of the figures that are the best."""
+    return {
         (name, k)
-        for name, cells in found.items()
+        for name, cells in figures.items()
         for k, (_, is_best) in enumerate(cells)
         if is_best
     }
-    if len(runs) == 1:
-        return table("Figures", names, rows)
-    between = [apart(runs[0], run) for run in runs[1:]]
-    if any(between):
-        cells = ["" if other is None else str(other) for other in between]
-        rows[f"distance from {runs[0].name}"] = ["–", *(cell or "–" for cell in cells)]
-    remark = f"In brackets the change from {runs[0].name}; bold: the best." if best else ""
-    return table("Figures", names, rows, best, remark)
 
 
 def _settings(runs: Sequence[FinishedRun]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -29,16 +30,22 @@ class Played:
     samples: int
 
 
+@dataclass(frozen=True, slots=True)
+class Playing:
+    """How a recording is published."""
+
+    rate: float | None  # times real time; None: as fast as it goes
+    quality: Quality  # "reliable" waits for slow subscribers
+    wait: bool = True  # for a subscriber to the left images, before the first one
+    stop: int | None = None  # frame after the last one; None: to the end
+
+
 def play(
     transport: Transport,
     dataset: Dataset,
     topics: SensorTopics,
-    *,
-    rate: float | None,
-    quality: Quality,
+    how: Playing,
     should_stop: Callable[[], object],
-    wait: bool = True,
-    stop: int | None = None,
 ) -> Played:
     """Publish the rectified images of a recording with their CameraInfo, its IMU samples, and the
     IMU's pose.
@@ -47,31 +54,30 @@ def play(
         transport: of the graph.
         dataset: the recording.
         topics: names; the right camera and the IMU are left out where the recording has none.
-        rate: times real time; None: as fast as it goes.
-        quality: "reliable" waits for slow subscribers.
+        how: rate, quality and span.
         should_stop: asked before each message.
-        wait: for a subscriber to the left images, before the first one.
-        stop: frame after the last one; None: to the end.
     """
     recording = dataset.recording
-    imu = topics.imu if recording.T_cam0_imu is not None and "imu" in recording.motion else None
+    imu = _topic_of_imu(recording, topics)
     cameras = topics.cameras if recording.camera.kind == "stereo" else topics.cameras[:1]
-    kinds = dict.fromkeys(cameras, IMAGE) | {info_topic(name): CAMERA_INFO for name in cameras}
-    out = publisher(transport, kinds if imu is None else {**kinds, imu: IMU}, default=quality)
-    if imu is not None and recording.T_cam0_imu is not None:
+    sensors = dict.fromkeys(cameras, IMAGE)
+    if imu is not None:
+        sensors[imu] = IMU
+    infos = {info_topic(name): CAMERA_INFO for name in cameras}
+    out = publisher(transport, sensors | infos, default=how.quality)
+    if imu is not None:
         first_ns = int(recording.frame_times_ns[0])
         out.static_transforms(
-            first_ns, [(IMU_FRAME, CAMERA_FRAMES[0], se3_inverse(recording.T_cam0_imu))]
+            first_ns, [(IMU_FRAME, CAMERA_FRAMES[0], se3_inverse(recording.T_cam0_body))]
         )
-    if wait:
-        sensors = [*cameras] if imu is None else [*cameras, imu]
+    if how.wait:
         _wait_for_subscribers(
-            transport, sensors, lambda: _publish_infos(out, cameras, recording), should_stop
+            transport, list(sensors), lambda: _publish_infos(out, cameras, recording), should_stop
         )
     frames = samples = 0
-    for event in _in_time(dataset.events(0, stop), rate):
-        if should_stop():
-            break
+    for event in itertools.takewhile(
+        lambda _: not should_stop(), _in_time(dataset.events(0, how.stop), how.rate)
+    ):
         if isinstance(event, StereoFrame):
             frames += 1
             _publish_frame(out, cameras, recording, event)
@@ -79,6 +85,12 @@ def play(
             samples += 1
             out.imu(imu, IMU_FRAME, event)
     return Played(frames, samples)
+
+
+def _topic_of_imu(recording: Recording, topics: SensorTopics) -> str | None:
+    """Return the topic of the samples; None: the recording has none, or not their pose."""
+    has_imu = recording.T_cam0_imu is not None and "imu" in recording.motion
+    return topics.imu if has_imu else None
 
 
 def _wait_for_subscribers(

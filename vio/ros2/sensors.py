@@ -61,6 +61,29 @@ class SensorTopics:
         return kinds if self.imu is None else {**kinds, self.imu: IMU}
 
 
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """How far a stamp is from the last one of its topic."""
+
+    stamped_ns: int
+    arrived_ns: int  # and between their arrivals
+
+    @property
+    def is_back(self) -> bool:
+        """Whether the stamp lies far before the last one."""
+        return self.stamped_ns < -_BACK_NS
+
+    @property
+    def is_ahead(self) -> bool:
+        """Whether it lies far after the last one, by far more than the time that has passed."""
+        return self.stamped_ns > _AHEAD_NS and self.arrived_ns < _PASSED * self.stamped_ns
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether it is after the last one, and not far."""
+        return self.stamped_ns > 0 and not self.is_ahead
+
+
 class Sensors:
     """Subscribes, and adds what comes to an odometry.
 
@@ -142,29 +165,33 @@ class Sensors:
         time_ns = stamp_of(fields)
         arrived_ns = round(time.monotonic() * NS_PER_S)
         before, last, last_arrived_ns = self._newest.get(topic, (None, None, 0))
-        back = last is not None and time_ns < last - _BACK_NS
-        ahead = last is not None and _is_ahead(time_ns - last, arrived_ns - last_arrived_ns)
-        if last is not None and back and before is not None and before < time_ns:
-            last = before  # that one was far ahead, alone; the odometry has left it out
-        elif last is not None and (back or ahead) and topic in self._stepped:
-            self._begin_anew(topic, time_ns - last)
-            last = None
-        elif last is not None and ahead:
-            self._stepped.add(topic)
-            self._refuse(
-                topic,
-                f"the stamp {time_ns} ns is {(time_ns - last) / NS_PER_S:.1f} s ahead of the last "
-                "one, and less time has passed",
-            )
-            return None
-        elif last is not None and time_ns <= last:
-            if back:
-                self._stepped.add(topic)
-            self._refuse(topic, f"the stamp {time_ns} ns is not after the last one, {last} ns")
-            return None
+        if last is not None:
+            step = _Step(time_ns - last, arrived_ns - last_arrived_ns)
+            if step.is_back and before is not None and before < time_ns:
+                last = before  # that one was far ahead, alone; the odometry has left it out
+            elif (step.is_back or step.is_ahead) and topic in self._stepped:
+                self._begin_anew(topic, time_ns - last)
+                last = None
+            elif not step.is_usual:
+                self._refuse_step(topic, step, time_ns)
+                return None
         self._newest[topic] = last, time_ns, arrived_ns
         self._stepped.discard(topic)
         return time_ns
+
+    def _refuse_step(self, topic: str, step: _Step, time_ns: int) -> None:
+        """Refuse a stamp that is not after the last one, or too far after it."""
+        if step.is_back or step.is_ahead:
+            self._stepped.add(topic)
+        if step.is_ahead:
+            self._refuse(
+                topic,
+                f"the stamp {time_ns} ns is {step.stamped_ns / NS_PER_S:.1f} s ahead of the last "
+                "one, and less time has passed",
+            )
+        else:
+            last = time_ns - step.stamped_ns
+            self._refuse(topic, f"the stamp {time_ns} ns is not after the last one, {last} ns")
 
     def _begin_anew(self, topic: str, step_ns: int) -> None:
         """Begin a new trajectory after a step of the stamps."""
@@ -194,11 +221,6 @@ class Sensors:
             return
         self._reasons.add(reason)
         log.warning("%s; such messages are left out, and counted in /diagnostics", line)
-
-
-def _is_ahead(step_ns: int, passed_ns: int) -> bool:
-    """Whether stamps have gone ahead by far more than the time that has passed."""
-    return step_ns > _AHEAD_NS and passed_ns < _PASSED * step_ns
 
 
 class Silence:

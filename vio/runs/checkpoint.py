@@ -15,10 +15,10 @@ import platform
 import types
 import zlib
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol
+from typing import Any, ClassVar, Generic, Literal, Protocol
 
 import numpy as np
 
@@ -193,26 +193,8 @@ class _Writer:
 
     def _list(self, value: Any) -> list[Any]:
         kind = type(value)
-        node = self.node
-        if kind in _SEQUENCES:
-            return [kind.__name__, *map(node, value)]
-        if kind is dict:
-            return ["dict", *(node(part) for pair in value.items() for part in pair)]
-        if kind is np.ndarray:
-            return self._array("array", value)
         if isinstance(value, np.generic):
             return self._array("scalar", np.array(value))
-        if kind is deque:
-            return ["deque", value.maxlen, *map(node, value)]
-        if kind is slice:
-            return ["slice", *map(node, (value.start, value.stop, value.step))]
-        if kind is complex:
-            return ["complex", value.real, value.imag]
-        if kind is bytes:
-            return self._array("bytes", np.frombuffer(value, dtype=np.uint8))
-        if kind is np.random.Generator:
-            bits = value.bit_generator
-            return ["generator", type(bits).__name__, node(bits.state)]
         if value is self._dataset:
             return ["dataset"]
         if (
@@ -221,7 +203,41 @@ class _Writer:
             and value.__name__ == "observations"
         ):
             return ["observations"]
-        return self._object(value, kind)
+        writes = self._WRITERS.get(kind)
+        return self._object(value, kind) if writes is None else writes(self, value)
+
+    def _sequence(self, value: Iterable[Any]) -> list[Any]:
+        return [type(value).__name__, *map(self.node, value)]
+
+    def _dict(self, value: dict[Any, Any]) -> list[Any]:
+        return ["dict", *(self.node(part) for pair in value.items() for part in pair)]
+
+    def _deque(self, value: deque[Any]) -> list[Any]:
+        return ["deque", value.maxlen, *map(self.node, value)]
+
+    def _slice(self, value: slice) -> list[Any]:
+        return ["slice", *map(self.node, (value.start, value.stop, value.step))]
+
+    def _complex(self, value: complex) -> list[Any]:
+        return ["complex", value.real, value.imag]
+
+    def _byte_string(self, value: bytes) -> list[Any]:
+        return self._array("bytes", np.frombuffer(value, dtype=np.uint8))
+
+    def _generator(self, value: np.random.Generator) -> list[Any]:
+        bits = value.bit_generator
+        return ["generator", type(bits).__name__, self.node(bits.state)]
+
+    _WRITERS: ClassVar[Mapping[type, Callable[[_Writer, Any], list[Any]]]] = {
+        **dict.fromkeys(_SEQUENCES, _sequence),
+        dict: _dict,
+        np.ndarray: lambda self, value: self._array("array", value),
+        deque: _deque,
+        slice: _slice,
+        complex: _complex,
+        bytes: _byte_string,
+        np.random.Generator: _generator,
+    }
 
     def _array(self, kind: str, value: np.ndarray[Any, Any]) -> list[Any]:
         if value.dtype.hasobject:

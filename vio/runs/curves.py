@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -204,15 +204,22 @@ def _mapped(
         truth = drawn.reference_body()
         alignment = settle_rotation(align_poses(T[found.rows], truth, "se3"), T[found.rows], truth)
         T_view_map = view_ref @ se3_from_parts(alignment.R, alignment.t)
-    place = {int(index): row for row, index in enumerate(run.estimates["index"])}
-    ends = [(loop.frame, loop.keyframe_frame) for loop in run.loops if loop.kept]
-    rows = [(place[a], place[b]) for a, b in ends if a in place and b is not None and b in place]
+    rows = list(_rows_of_loops(run))
     p: FloatArray = transform_points(T_view_map, T[:, :3, 3])
     return Mapped(
         position=p[thinned(len(p))],
         keyframes=transform_points(T_view_map, run.map_keyframes.T_map_body[:, :3, 3]),
         loops=p[np.array(rows, dtype=np.int64).reshape(-1, 2)],
     )
+
+
+def _rows_of_loops(run: FinishedRun) -> Iterator[tuple[int, int]]:
+    """Yield the rows of the two poses that each kept loop of a run connects."""
+    place = {int(index): row for row, index in enumerate(run.estimates["index"])}
+    for loop in run.loops:
+        earlier = loop.keyframe_frame
+        if loop.kept and earlier is not None and {loop.frame, earlier} <= place.keys():
+            yield place[loop.frame], place[earlier]
 
 
 def _truth(run: DrawnRun, evaluation: Evaluation, view_ref: FloatArray, most: int | None) -> Truth:

@@ -10,7 +10,7 @@ import platform
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import asdict, field, fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +42,8 @@ from vio.runs.stated import REQUEST_SHAPE, RunRequest, read_metrics, read_stated
 from vio.runs.tables import frames_csv
 
 if TYPE_CHECKING:
+    from vio.files.tables import Records
+    from vio.records import FrameLog
     from vio.runs.mapped import MappedRun
     from vio.runs.picture import RunPicture
 
@@ -74,11 +76,10 @@ def write_run_folder(
     Raises:
         VioError: the folder cannot be written, or contains something else.
     """
+    how = Finishing(lengths_m, save_observations)
     with atomic_folder(folder, replace=True, marker=RunFile.METRICS, own=FILES) as temporary:
         np.save(temporary / RunFile.ESTIMATES, result.estimates.rows)
-        metrics, picture = _write_files(
-            temporary, folder, result, reference, lengths_m, save_observations=save_observations
-        )
+        metrics, picture = _write_files(temporary, folder, result, reference, how)
         assert picture is not None
         picture.write(temporary / RunFile.PICTURE)
     return metrics
@@ -90,9 +91,10 @@ class Finishing:
 
     lengths_m: Sequence[float] | None  # path lengths of the drift, see `evaluate`
     save_observations: bool
-    more: Mapping[str, Any]  # into the metrics
-    plot: bool
-    finished: Callable[[dict[str, Any]], None]  # gets the metrics before the picture is drawn
+    more: Mapping[str, Any] = field(default_factory=dict)  # into the metrics
+    plot: bool = True
+    # gets the metrics before the picture is drawn
+    finished: Callable[[dict[str, Any]], None] = lambda metrics: None
 
 
 def finish_run_folder(
@@ -115,16 +117,7 @@ def finish_run_folder(
         if final.exists():  # of a process that died
             shutil.rmtree(final)
         final.mkdir()
-        metrics, picture = _write_files(
-            final,
-            folder,
-            result,
-            reference,
-            how.lengths_m,
-            save_observations=how.save_observations,
-            plot=how.plot,
-            more=how.more,
-        )
+        metrics, picture = _write_files(final, folder, result, reference, how)
         shutil.copyfile(unfinished / RunFile.ESTIMATES, final / RunFile.ESTIMATES)
         for name in sorted(path.name for path in final.iterdir() if path.name != RunFile.METRICS):
             (final / name).replace(folder / name)
@@ -219,64 +212,69 @@ def read_request(folder: Path) -> RunRequest:
 
 
 def _write_files(
-    target: Path,
-    folder: Path,
-    result: RunResult,
-    reference: Trajectory | None,
-    lengths_m: Sequence[float] | None,
-    *,
-    save_observations: bool,
-    plot: bool = True,
-    more: Mapping[str, Any] | None = None,
+    target: Path, folder: Path, result: RunResult, reference: Trajectory | None, how: Finishing
 ) -> tuple[dict[str, Any], RunPicture | None]:
     """Write all results but `estimates.npy` into `target`; return the metrics, which name
-    `folder`, and the picture where it is to be drawn (`plot`).
+    `folder`, and the picture where it is to be drawn.
     """
-    evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
-    metrics = {**metrics_of(result, evaluation, dead_reckoning, folder), **(more or {})}
+    evaluation, dead_reckoning = score(result, reference, lengths_m=how.lengths_m)
+    metrics = {**metrics_of(result, evaluation, dead_reckoning, folder), **how.more}
     (target / RunFile.CONFIG).write_text(to_yaml(result.config), encoding="utf-8")
     write_tum(target / RunFile.TRAJECTORY, result.trajectory)
     write_kitti(
         target / RunFile.TRAJECTORY_KITTI, in_first_cam0(result.trajectory, result.T_cam0_body)
     )
     if evaluation is not None:
-        times_ns = result.trajectory.times_ns
-        assert times_ns is not None
-        # The poses that were compared, each at the time of its estimate: the folder alone then
-        # gives the errors.
-        write_tum(
-            target / RunFile.REFERENCE,
-            replace(evaluation.reference, times_ns=times_ns[evaluation.rows]),
-        )
+        _write_compared(target, result, evaluation)
     if result.dead_reckoning is not None:
         write_tum(target / RunFile.DEAD_RECKONING, result.dead_reckoning)
     if result.mapped is not None:
         metrics["map"] = _write_mapped(target, result, result.mapped, reference)
     write_landmarks_ply(target / RunFile.LANDMARKS, result.landmarks)
-    frames = result.frames
-    stages = sorted({name for frame in result.frames for name in frame.stages_ms})
+    _write_frames(target, result.frames)
+    if how.save_observations:
+        _write_observations(target, result)
+    (target / RunFile.METRICS).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
+    if not how.plot:
+        return metrics, None
+    from vio.runs.picture import RunPicture
+
+    return metrics, RunPicture.of(result, evaluation, dead_reckoning)
+
+
+def _write_compared(target: Path, result: RunResult, evaluation: Evaluation) -> None:
+    """Write the poses of the reference that were compared, each at the time of its estimate: the
+    folder alone then gives the errors.
+    """
+    times_ns = result.trajectory.times_ns
+    assert times_ns is not None
+    write_tum(
+        target / RunFile.REFERENCE,
+        replace(evaluation.reference, times_ns=times_ns[evaluation.rows]),
+    )
+
+
+def _write_frames(target: Path, frames: Records[FrameLog]) -> None:
+    """Write the table of the frames, some at a time."""
+    stages = sorted({name for frame in frames for name in frame.stages_ms})
     with (target / RunFile.FRAMES).open("w", encoding="utf-8", newline="\n") as stream:
         for start in range(0, len(frames), _CHUNK_FRAMES):
             stream.write(
                 frames_csv(frames[start : start + _CHUNK_FRAMES], stages, header=start == 0)
             )
-    if save_observations:
-        from vio.datasets.observation_log import write_observation_log
 
-        seen = result.observations
-        samples = result.motion_samples
-        assert seen is not None
-        assert samples is not None
-        run_motion = result.motion or "none"
-        write_observation_log(
-            target / RunFile.OBSERVATIONS, result.recording, seen, samples, run_motion=run_motion
-        )
-    (target / RunFile.METRICS).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
-    if not plot:
-        return metrics, None
-    from vio.runs.picture import RunPicture
 
-    return metrics, RunPicture.of(result, evaluation, dead_reckoning)
+def _write_observations(target: Path, result: RunResult) -> None:
+    from vio.datasets.observation_log import write_observation_log
+
+    seen = result.observations
+    samples = result.motion_samples
+    assert seen is not None
+    assert samples is not None
+    run_motion = result.motion or "none"
+    write_observation_log(
+        target / RunFile.OBSERVATIONS, result.recording, seen, samples, run_motion=run_motion
+    )
 
 
 def _write_mapped(

@@ -400,22 +400,7 @@ class RunRecorder:
             self._tables = {name: Table(dtype) for name, dtype in _TABLES.items()}
         else:
             with self._writing():
-                self._folder.path.mkdir(parents=True, exist_ok=True)
-                texts = self._folder.texts
-                early = [name for name in texts if not name.startswith(RunFile.UNFINISHED)]
-                for name in early:  # they say whose folder it is
-                    atomic_write_text(self._folder.path / name, texts[name])
-                for name in (
-                    RunFile.UNFINISHED,
-                    *(n for n in self._folder.replaces if n not in texts),
-                ):
-                    if (old := self._folder.path / name).is_dir() and not old.is_symlink():
-                        shutil.rmtree(old)
-                    else:
-                        old.unlink(missing_ok=True)
-                self._unfinished.mkdir()
-                for name in sorted(texts.keys() - early):
-                    atomic_write_text(self._folder.path / name, texts[name])
+                _claim(self._folder)
                 self._tables = {
                     name: Table(dtype, self._unfinished / f"{name}.npy")
                     for name, dtype in _TABLES.items()
@@ -467,3 +452,24 @@ def _fastest_mps(rows: Rows) -> float:
         return 0.0
     steps_m = np.linalg.norm(np.diff(usable["T_world_imu"][:, :3, 3], axis=0), axis=1)
     return float(np.max(steps_m / (np.diff(usable["time_ns"]) / NS_PER_S)))
+
+
+def _claim(folder: GrowingFolder) -> None:
+    """Make a folder that of a run, and remove what an earlier one left there.
+
+    The texts that say whose folder it is come first.
+    """
+    folder.path.mkdir(parents=True, exist_ok=True)
+    texts = folder.texts
+    early = [name for name in texts if not name.startswith(RunFile.UNFINISHED)]
+    for name in early:
+        atomic_write_text(folder.path / name, texts[name])
+    stale = [name for name in folder.replaces if name not in texts]
+    for name in (RunFile.UNFINISHED, *stale):
+        if (old := folder.path / name).is_dir() and not old.is_symlink():
+            shutil.rmtree(old)
+        else:
+            old.unlink(missing_ok=True)
+    (folder.path / RunFile.UNFINISHED).mkdir()
+    for name in sorted(texts.keys() - early):
+        atomic_write_text(folder.path / name, texts[name])

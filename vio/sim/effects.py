@@ -65,18 +65,16 @@ class SensorEffects:
     )
 
     def __post_init__(self) -> None:
-        if self.exposure < 0 or self.right_gain < 0 or self.gamma <= 0 or self.blur_samples < 1:
+        if min(self.exposure, self.right_gain, self.blur_samples - 1) < 0 or self.gamma <= 0:
             raise SimulationError(
                 "exposure and gain must not be negative; gamma and blur_samples must be positive"
             )
         if not (0 <= self.vignetting <= 1 and 0 <= self.exposure_swing <= 1):
             raise SimulationError("vignetting and exposure_swing must be between 0 and 1")
-        if self.read_noise < 0 or self.full_well < 0 or self.blur_exposure_ms < 0:
+        if min(self.read_noise, self.full_well, self.blur_exposure_ms) < 0:
             raise SimulationError("read_noise, full_well and blur_exposure_ms must not be negative")
-        if (
-            min(self.shutter_ms, self.shutter_max_ms, self.exposure_target) <= 0
-            or self.gain_max < 1
-        ):
+        control = min(self.shutter_ms, self.shutter_max_ms, self.exposure_target)
+        if control <= 0 or self.gain_max < 1:
             raise SimulationError(
                 "shutter times and exposure_target must be positive, gain_max at least 1"
             )

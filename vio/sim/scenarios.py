@@ -239,14 +239,15 @@ def _check(scenario: Scenario) -> None:
         )
     if scenario.seed < 0:
         raise SimulationError(f"the seed must not be negative, got {scenario.seed}")
-    if not 0 <= scenario.conditions.people <= 100:
-        raise SimulationError(
-            f"{scenario.conditions.people} people cannot be placed; choose 0 to 100"
-        )
+    _check_effects(scenario)
+
+
+def _check_effects(scenario: Scenario) -> None:
+    """Raise SimulationError where the scene cannot have the effects that are asked for."""
     hard = scenario.conditions
-    if scenario.scene == "doors" and (
-        hard.bare_wall or hard.moving or hard.people or hard.lighting
-    ):
+    if not 0 <= hard.people <= 100:
+        raise SimulationError(f"{hard.people} people cannot be placed; choose 0 to 100")
+    if scenario.scene == "doors" and any((hard.bare_wall, hard.moving, hard.people, hard.lighting)):
         raise SimulationError("the corridor of equal doors has no effects of a scene; use corridor")
 
 
@@ -377,19 +378,36 @@ def _scene(
     """
     hard = scenario.conditions
     seed = scenario.seed
-    # in uneven light even a blank wall shows something
-    bare: TextureKind = "plaster" if hard.lighting else "bare"
     if scenario.scene == "street":
         return street(seed, moving=moving, sunlit=hard.lighting, bare_houses=hard.bare_wall)
     if scenario.scene == "doors":
         return equal_doors(seed)
     if scenario.scene == "corridor":
         sides = ("+y", "-y") if hard.bare_wall else ("+y",)
-        return corridor(seed, bare_walls=sides, bare_kind=bare, moving=moving)
+        return corridor(seed, bare_walls=sides, bare_kind=_bare_kind(hard), moving=moving)
+    return _room(scenario, motion, moving, walks, furnished=furnished)
+
+
+def _bare_kind(hard: Conditions) -> TextureKind:
+    """Return the texture of a bare wall: in uneven light even a blank one shows something."""
+    return "plaster" if hard.lighting else "bare"
+
+
+def _room(
+    scenario: Scenario,
+    motion: MotionSpline,
+    moving: Sequence[MovingBox],
+    walks: Sequence[Walk],
+    *,
+    furnished: bool,
+) -> World:
+    """Return the room with boxes moving in it; its furniture stays off the ways of people."""
+    hard = scenario.conditions
+    seed = scenario.seed
     walls = ("+x", "+y") if hard.bare_wall else ()
     windows = _WINDOWS if hard.lighting else 0
     inside = functools.partial(
-        room, seed, bare_walls=walls, bare_kind=bare, moving=moving, windows=windows
+        room, seed, bare_walls=walls, bare_kind=_bare_kind(hard), moving=moving, windows=windows
     )
     recorded = isinstance(scenario.trajectory, Path)
     around = room_around(motion, seed=seed) if recorded else room(seed)

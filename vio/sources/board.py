@@ -41,9 +41,8 @@ def film_board(
     guidance = Guidance(target)
     said = ""
     with contextlib.closing(source), contextlib.ExitStack() as stack:
-        searcher = stack.enter_context(ThreadPoolExecutor(1))
+        search = _Search(guidance, stack.enter_context(ThreadPoolExecutor(1)), wait=every_frame)
         recorder: Recorder | None = None
-        search: Future[bool] | None = None
         for event in source.events():
             if should_stop():
                 break
@@ -57,18 +56,32 @@ def film_board(
                 recorder.add(event)
             if not isinstance(event, SourceFrame):
                 guidance.add_sample(event)
-                continue
-            if search is None:
-                images = (event.left,) if event.right is None else (event.left, event.right)
-                search = searcher.submit(guidance.add_images, images)
-            if not every_frame and not search.done():
-                continue
-            search.result()
-            search = None
-            lacks = guidance.lacks()
-            if str(lacks) != said:
-                said = str(lacks)
-                say(said)
-            if not lacks.wanted:
-                break
+            elif search.take(event):
+                lacks = guidance.lacks()
+                if str(lacks) != said:
+                    said = str(lacks)
+                    say(said)
+                if not lacks.wanted:
+                    break
     return guidance.lacks()
+
+
+class _Search:
+    """The search for the board in one frame at a time, in a thread."""
+
+    def __init__(self, guidance: Guidance, thread: ThreadPoolExecutor, *, wait: bool) -> None:
+        self._guidance = guidance
+        self._thread = thread
+        self._wait = wait
+        self._running: Future[bool] | None = None
+
+    def take(self, frame: SourceFrame) -> bool:
+        """Begin with a frame where none is searched; return whether a search has ended."""
+        if self._running is None:
+            images = (frame.left,) if frame.right is None else (frame.left, frame.right)
+            self._running = self._thread.submit(self._guidance.add_images, images)
+        if not self._wait and not self._running.done():
+            return False
+        self._running.result()
+        self._running = None
+        return True

@@ -150,6 +150,11 @@ class OakSource:
             K, _STREAMS.width, _STREAMS.height, kind, values[:_COEFFICIENTS], self._name
         )
 
+    def _imu_packets(self) -> list[Any]:
+        """Return the packets of samples that have come."""
+        messages = [] if self._imu is None else self._imu.tryGetAll()
+        return [packet for message in messages for packet in message.packets]
+
     def events(self) -> Iterator[SourceEvent | None]:
         """Yield pairs and samples.
 
@@ -160,17 +165,16 @@ class OakSource:
         last_s = time.monotonic()
         pairing: Pairing[Image] = Pairing()
         while True:
-            came = False
-            for packets in [] if self._imu is None else self._imu.tryGetAll():
-                for packet in packets.packets:
-                    for take, read in (
-                        (imu.accel, packet.acceleroMeter),
-                        (imu.gyro, packet.gyroscope),
-                    ):
-                        yield from take(
-                            _ns(read.getTimestampDevice()), np.array([read.x, read.y, read.z])
-                        )
-                came = True
+            packets = self._imu_packets()
+            came = bool(packets)
+            for packet in packets:
+                for take, read in (
+                    (imu.accel, packet.acceleroMeter),
+                    (imu.gyro, packet.gyroscope),
+                ):
+                    yield from take(
+                        _ns(read.getTimestampDevice()), np.array([read.x, read.y, read.z])
+                    )
             for side, images in enumerate(self._images):
                 for message in images.tryGetAll():
                     came = True

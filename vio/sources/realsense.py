@@ -111,25 +111,29 @@ class RealSenseSource:
             raise DataError(f"realsense:{name}: no such camera; connected are: {have}")
         return found[name] if name else next(iter(found.values()))
 
+    def _is_usable(self, profile: Any) -> bool:
+        """Tell whether an infrared stream is gray, and in a file or of the form that is wanted."""
+        video = profile.as_video_stream_profile()
+        form = (video.width(), video.height(), video.fps())
+        wanted = (_STREAMS.width, _STREAMS.height, _STREAMS.rate_hz)
+        return bool(profile.format() == self._rs.format.y8) and (self._is_file or form == wanted)
+
     def _chosen_profiles(self) -> dict[str, tuple[Any, Any]]:
         """Return sensor and profile of each stream: left, right, and gyro and accel where the
         device has them.
         """
         rs = self._rs
+        motion = {rs.stream.gyro: "gyro", rs.stream.accel: "accel"}
         found = dict[str, tuple[Any, Any]]()
         for sensor in self._device.query_sensors():
             for profile in sensor.get_stream_profiles():
                 kind = profile.stream_type()
                 index = profile.stream_index()
                 if kind == rs.stream.infrared and index in (1, 2):
-                    video = profile.as_video_stream_profile()
-                    form = (video.width(), video.height(), video.fps())
-                    if profile.format() == rs.format.y8 and (
-                        self._is_file or form == (_STREAMS.width, _STREAMS.height, _STREAMS.rate_hz)
-                    ):
+                    if self._is_usable(profile):
                         found[("left", "right")[index - 1]] = sensor, profile
-                elif kind in (rs.stream.gyro, rs.stream.accel):
-                    name = "gyro" if kind == rs.stream.gyro else "accel"
+                elif kind in motion:
+                    name = motion[kind]
                     if name not in found or profile.fps() > found[name][1].fps():
                         found[name] = sensor, profile
         if not {"left", "right"} <= set(found):

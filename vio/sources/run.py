@@ -31,18 +31,25 @@ class LiveRun:
     samples: int  # of the IMU
 
 
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """What a live run keeps, and how it takes what comes."""
+
+    kept: LiveRunSettings | None = None  # the run folder; None: there is none
+    record: Path | None = None  # new folder for what the source gave, which `vio run` repeats
+    record_as: Form = "plain"  # its form, see `Recorder`
+    map: MapUse | None = None  # a map to begin or to continue
+    drop: Drop = "oldest"  # see `LiveOdometry`
+
+
 def run_source(
     source: LiveSource,
     config: Config,
     rig: Rig | None,
+    options: LiveOptions,
     *,
     should_stop: Callable[[], object],
     say: Callable[[str], None],
-    kept: LiveRunSettings | None = None,
-    record: Path | None = None,
-    record_as: Form = "plain",
-    map: MapUse | None = None,
-    drop: Drop = "oldest",
     on_start: Callable[
         [LiveOdometry, Rig], Callable[[FrameResult], None] | None
     ] = lambda odometry, rig: None,
@@ -53,32 +60,20 @@ def run_source(
         source: opened; it is closed at the end.
         config: every setting.
         rig: calibration in place of the device's.
+        options: what is kept.
         should_stop: asked with each event, and about each second.
         say: reports that it is ready.
-        kept: the run folder; None: there is none.
-        record: new folder for what the source gave, which `vio run` repeats.
-        record_as: its form, see `Recorder`.
-        map: a map to begin or to continue.
-        drop: see `LiveOdometry`.
         on_start: may return what is called with each result, a viewer's.
 
     Raises:
         VioError: there is no calibration, images do not fit it, or source, disk or estimation have
             failed.
     """
+    kept = options.kept
     with contextlib.closing(source):
-        rig = rig or source.rig
-        if rig is None:
-            raise CalibrationError(
-                "this source has no calibration of its own; give --calibration FILE"
-            )
-        if source.has_imu and rig.T_cam0_imu is None:
-            raise CalibrationError(
-                "the calibration has no T_cam_imu for this camera's IMU; give one that has"
-            )
+        rig = _rig_of(source, rig)
         if not source.has_imu:
             config = replace(config, motion="none")
-            rig = replace(rig, T_cam0_imu=None)
         watcher: Callable[[FrameResult], None] | None = None
         has_poses = False
 
@@ -89,13 +84,12 @@ def run_source(
                 watcher(result)
 
         folder = None if kept is None else LiveFolder(kept, config, rig)
-        samples = 0
         odometry = LiveOdometry(
             rig,
             config,
             on_frame=on_frame,
-            map=map,
-            drop=drop,
+            map=options.map,
+            drop=options.drop,
             copy_images=False,
             sink=folder,
         )
@@ -104,26 +98,57 @@ def run_source(
                 say("warming up")
                 odometry.warm_up()
                 watcher = on_start(odometry, rig)
-                recorder = None if record is None else Recorder(record, rig, record_as)
-                if recorder is not None:
+                recorder = None
+                if options.record is not None:
+                    recorder = Recorder(options.record, rig, options.record_as)
                     stack.callback(recorder.close)
                 say("ready")
-                for event in source.events():
-                    if should_stop():
-                        break
-                    odometry.check()
-                    if event is None:
-                        continue
-                    if recorder is not None:
-                        recorder.add(event)
-                    if isinstance(event, SourceFrame):
-                        odometry.add_images(event.time_ns, event.left, event.right)
-                    else:
-                        samples += 1
-                        odometry.add_imu(event.time_ns, event.gyro, event.accel)
+                samples = _feed(source, odometry, recorder, should_stop)
         finally:  # however it ends, what was computed is kept
             if folder is not None:
                 folder.close()
         if kept is not None and not has_poses:
             raise DataError(f"{kept.out}: no frame has a pose; nothing was written")
         return LiveRun(odometry.figures, odometry.warnings, samples)
+
+
+def _rig_of(source: LiveSource, given: Rig | None) -> Rig:
+    """Return the calibration that is given, else the source's; without an IMU where that has none.
+
+    Raises:
+        CalibrationError: there is none, or it lacks the pose of the source's IMU.
+    """
+    rig = given or source.rig
+    if rig is None:
+        raise CalibrationError("this source has no calibration of its own; give --calibration FILE")
+    if not source.has_imu:
+        return replace(rig, T_cam0_imu=None)
+    if rig.T_cam0_imu is None:
+        raise CalibrationError(
+            "the calibration has no T_cam_imu for this camera's IMU; give one that has"
+        )
+    return rig
+
+
+def _feed(
+    source: LiveSource,
+    odometry: LiveOdometry,
+    recorder: Recorder | None,
+    should_stop: Callable[[], object],
+) -> int:
+    """Give all events to odometry and recorder, and return the number of IMU samples."""
+    samples = 0
+    for event in source.events():
+        if should_stop():
+            break
+        odometry.check()
+        if event is None:
+            continue
+        if recorder is not None:
+            recorder.add(event)
+        if isinstance(event, SourceFrame):
+            odometry.add_images(event.time_ns, event.left, event.right)
+        else:
+            samples += 1
+            odometry.add_imu(event.time_ns, event.gyro, event.accel)
+    return samples

@@ -344,15 +344,15 @@ class RerunViewer:
         known = dict(numbers)
         if estimate.velocity_world is not None:
             known["velocity"] = (view[:3, :3] @ estimate.velocity_world).tolist()
-        for name, value in (("gyro_bias", estimate.gyro_bias), ("accel_bias", estimate.accel_bias)):
-            if value is not None and self._rig.motion == "imu":
-                known[name] = value.tolist()
+        if self._rig.motion == "imu":
+            biases = {"gyro_bias": estimate.gyro_bias, "accel_bias": estimate.accel_bias}
+            known |= {name: b.tolist() for name, b in biases.items() if b is not None}
         if estimate.stereo_field is not None:
             known["stereo_calibration"] = (
                 self._rig.camera.fu * estimate.stereo_field.coefficients[:3]
             ).tolist()
         for name, values in known.items():
-            plain = [np.nan if value is None else float(value) for value in values]
+            plain = np.array(values, dtype=np.float64)  # None is NaN
             if np.isfinite(plain).any():
                 self._stream.log(f"plots/{name}", rr.Scalars(plain))
 

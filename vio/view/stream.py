@@ -51,25 +51,30 @@ def open_stream(where: str, name: str) -> tuple[rr.RecordingStream, str | None]:
         rr.serve_web_viewer(web_port=_WEB_PORT, connect_to=served, open_browser=False)
         address = f"http://127.0.0.1:{_WEB_PORT}/?url={quote(served, safe='')}"
     elif where.endswith(".rrd"):
-        path = Path(where)
-        if not path.parent.is_dir():
-            raise DataError(f"{path}: its folder does not exist; create it or choose another")
-        try:
-            if not _is_replaceable(path):
-                raise DataError(
-                    f"{path} exists and was not made by this command; remove it, or choose "
-                    "another name"
-                )
-            path.open("ab").close()  # leaves what is there, until the first frame comes
-        except OSError as error:
-            raise DataError(f"{path}: cannot be written ({error.strerror})") from error
-        stream.save(path)
+        _check_file(Path(where))
+        stream.save(Path(where))
     else:
         raise ConfigError(
             f"--view {where}: takes nothing (a window), web, or a file *.rrd; write SOURCE before "
             "it"
         )
     return stream, address
+
+
+def _check_file(path: Path) -> None:
+    """Raise DataError where a file cannot be written; what it holds stays until the first frame
+    comes.
+    """
+    if not path.parent.is_dir():
+        raise DataError(f"{path}: its folder does not exist; create it or choose another")
+    try:
+        if not _is_replaceable(path):
+            raise DataError(
+                f"{path} exists and was not made by this command; remove it, or choose another name"
+            )
+        path.open("ab").close()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def _is_replaceable(path: Path) -> bool:

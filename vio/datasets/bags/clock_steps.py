@@ -13,7 +13,7 @@ A clock of stamps and of the recorder that leaps cannot be told from a pause of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,18 +79,34 @@ def mended(
         size_ns = _common_size(together, stamps)
         first = {step.topic: step.row for step in together}
         begin_ns = min(step.logged_ns for step in together)
-        for topic in stamps.keys() - first.keys():
-            row = _row_without_descent(stamps[topic], logged[topic], begin_ns, size_ns)
-            if row is not None:
-                first[topic] = row
-        for topic, row in first.items():
-            stamps[topic][row:] += size_ns
+        others = stamps.keys() - first.keys()
+        first |= _rows_without_descent(others, stamps, logged, (begin_ns, size_ns))
         steps.append(ClockStep(size_ns, begin_ns, first))
+        _take_out(steps[-1], stamps)
     for leap in _leaps(stamps, logged):
-        for topic, row in leap.first.items():
-            stamps[topic][row:] += leap.size_ns
+        _take_out(leap, stamps)
         steps.append(leap)
     return stamps, steps
+
+
+def _rows_without_descent(
+    topics: Iterable[str],
+    stamps: Mapping[str, IntArray],
+    logged: Mapping[str, IntArray],
+    step_ns: tuple[int, int],
+) -> dict[str, int]:
+    """Return the row of a step in each topic whose stamps do not descend there.
+
+    `step_ns` is when it was logged, and its size; topics without it are absent.
+    """
+    rows = {t: _row_without_descent(stamps[t], logged[t], *step_ns) for t in topics}
+    return {topic: row for topic, row in rows.items() if row is not None}
+
+
+def _take_out(step: ClockStep, stamps: dict[str, IntArray]) -> None:
+    """Move the stamps from a step on, in place."""
+    for topic, row in step.first.items():
+        stamps[topic][row:] += step.size_ns
 
 
 def _leaps(stamps: Mapping[str, IntArray], logged: Mapping[str, IntArray]) -> list[ClockStep]:

@@ -17,10 +17,11 @@ from vio.datasets.bags.topics import Roles, choose
 from vio.datasets.companions import check_overlap, imu_on_camera_clock
 from vio.datasets.images import UnreadableImageError, decode_gray
 from vio.datasets.rigs import find_calibration, load_rig
-from vio.datasets.rigs.camera_info import rig_from_camera_infos
+from vio.datasets.rigs.camera_info import CameraInfo, rig_from_camera_infos
 from vio.datasets.samples import MotionSamples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
+from vio.geometry.lie import FloatArray
 from vio.imu.sampling import sampling_notes
 from vio.records import IntArray, MotionSample
 
@@ -137,25 +138,34 @@ def _rig(found: Contents, file: Path | None) -> Rig:
     infos = found.infos
     if file is not None:
         return load_rig(file, image_size=found.size, cameras=1 if len(topics) == 1 else 2)
-    stated = [
-        found.index.infos[name] for name in infos if name is not None and name in found.index.infos
-    ]
-    rectified = _is_rectified(topics[0])
+    known = found.index.infos
+    stated = [known[name] for name in infos if name is not None and name in known]
     if len(stated) != len(topics):
         raise CalibrationError(
             f"{found.path}: no CameraInfo could be read; give --calibration FILE"
         )
     if len(set(infos)) != len(topics):
         raise CalibrationError(f"{infos[0]} belongs to both images; give --calibration FILE")
+    rectified = _is_rectified(topics[0])
     if len(stated) > 1 and not states_baseline(stated[1]):
-        T_right_left = found.index.transform(
-            found.index.right.frame_id.lstrip("/"), found.index.left.frame_id.lstrip("/")
-        )
-        if T_right_left is not None and found.index.left.frame_id != found.index.right.frame_id:
+        T_right_left = _stereo_pose_of_frames(found.index)
+        if T_right_left is not None:
             source = found.index.frames_from
-            images = [info.of_images(found.size) for info in stated]
+            images = _of_images(stated, found.size)
             return rig_with_baseline(images, T_right_left, source, rectified=rectified)
     return rig_from_camera_infos(stated, rectified=rectified, image_size=found.size)
+
+
+def _of_images(infos: Sequence[CameraInfo], size: Size | None) -> list[CameraInfo]:
+    """Return the calibrations of images of a size."""
+    return [info.of_images(size) for info in infos]
+
+
+def _stereo_pose_of_frames(index: BagIndex) -> FloatArray | None:
+    """Return the pose (4, 4) of the left camera in the right one, as the bag's frames state it."""
+    left = index.left.frame_id
+    right = index.right.frame_id
+    return None if left == right else index.transform(right.lstrip("/"), left.lstrip("/"))
 
 
 def _with_static_pose(rig: Rig, found: Contents) -> Rig:
@@ -181,15 +191,7 @@ def motion_of(
     """Return the samples in time order on the cameras' clock, and notes."""
     index = found.index
     roles = found.roles
-    notes = [
-        f"{count} messages of {topic} were recorded out of order and are sorted"
-        for topic, count in index.disordered.items()
-    ]
-    notes += [
-        f"{count} messages of {topic} are not finite and are left out"
-        for topic, count in index.not_finite.items()
-    ]
-    parts: list[Sequence[MotionSample]] = []
+    notes = _left_out_notes(index)
     record = index.imu_record()
     if roles.imu is not None and record is not None and not record.accel.any():
         raise DataError(
@@ -198,13 +200,8 @@ def motion_of(
             "imu=/GYRO,accel=/ACCEL, or leave it out with imu=none"
         )
     if rig.T_cam0_imu is None and (record is not None or index.velocities):
-        which = " and ".join(t.name for t in (roles.imu, roles.velocity) if t is not None)
-        notes.append(
-            f"{which} cannot be used: its pose in the camera is unknown; give --calibration FILE "
-            "with T_cam_imu, as "
-            "Kalibr's camchain-imucam; images alone"
-        )
-        return in_time_order(), notes
+        return in_time_order(), [*notes, _unusable_motion(roles)]
+    parts: list[Sequence[MotionSample]] = []
     if record is not None and roles.imu is not None:
         samples, moved = imu_on_camera_clock(
             record, rig, times_ns, f"{found.path}, {roles.imu.name}"
@@ -216,3 +213,27 @@ def motion_of(
         notes.append(f"the twist of {roles.velocity.name} is taken in the frame of T_cam0_imu")
         parts.append(speeds)
     return in_time_order(*parts), notes
+
+
+def _left_out_notes(index: BagIndex) -> list[str]:
+    """Return which messages were sorted, and which are left out."""
+    return [
+        *(
+            f"{count} messages of {topic} were recorded out of order and are sorted"
+            for topic, count in index.disordered.items()
+        ),
+        *(
+            f"{count} messages of {topic} are not finite and are left out"
+            for topic, count in index.not_finite.items()
+        ),
+    ]
+
+
+def _unusable_motion(roles: Roles) -> str:
+    """Return what is said of motion sensors whose pose in the camera is unknown."""
+    which = " and ".join(t.name for t in (roles.imu, roles.velocity) if t is not None)
+    return (
+        f"{which} cannot be used: its pose in the camera is unknown; give --calibration FILE "
+        "with T_cam_imu, as "
+        "Kalibr's camchain-imucam; images alone"
+    )

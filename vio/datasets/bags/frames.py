@@ -79,6 +79,14 @@ def add_frames_of_tf(bag: Bag, index: BagIndex, roles: Roles, infos: Sequence[st
     """
     if _add_sdk_frames(bag, index, roles) or _connected(index, roles, infos):
         return
+    fixed = {key: T for key, T in _fixed_frames(bag).items() if key not in index.frames}
+    index.frames.update(fixed)
+    if fixed and _connected(index, roles, infos):
+        index.frames_from = "/tf, where it does not change"
+
+
+def _fixed_frames(bag: Bag) -> dict[tuple[str, str], FloatArray]:
+    """Return the transforms (4, 4) on /tf that never change, by parent and child."""
     topics = [t.name for t in bag.topics if t.kind == TF and not t.name.endswith("tf_static")]
     first: dict[tuple[str, str], FloatArray] = {}
     moving: set[tuple[str, str]] = set()
@@ -88,10 +96,7 @@ def add_frames_of_tf(bag: Bag, index: BagIndex, roles: Roles, infos: Sequence[st
             T = transform_of(item.transform)
             if np.abs(T - first.setdefault(key, T)).max() > _SAME:
                 moving.add(key)
-    still = {key: T for key, T in first.items() if key not in moving and key not in index.frames}
-    index.frames.update(still)
-    if still and _connected(index, roles, infos):
-        index.frames_from = "/tf, where it does not change"
+    return {key: T for key, T in first.items() if key not in moving}
 
 
 def _connected(index: BagIndex, roles: Roles, infos: Sequence[str | None]) -> bool:
@@ -109,8 +114,7 @@ def _add_sdk_frames(bag: Bag, index: BagIndex, roles: Roles) -> bool:
     left = _SDK_STREAM.fullmatch(roles.left.name)
     if left is None:
         return False
-    sensors = [topic for topic in (*roles.cameras, roles.imu) if topic is not None]
-    transforms = _sdk_transforms(bag, sensors)
+    transforms = _sdk_transforms(bag, list(filter(None, (*roles.cameras, roles.imu))))
     if roles.left.name not in transforms:
         return False
     T_left = transforms[roles.left.name]
@@ -120,19 +124,14 @@ def _add_sdk_frames(bag: Bag, index: BagIndex, roles: Roles) -> bool:
     index.left.frame_id = roles.left.name
     index.right.frame_id = "" if roles.right is None else roles.right.name
     index.imu_frame = "" if roles.imu is None else roles.imu.name
-    for name, T in transforms.items():
-        index.frames[("realsense", name.lstrip("/"))] = T
+    index.frames |= {("realsense", name.lstrip("/")): T for name, T in transforms.items()}
     index.frames_from = "the transforms of RealSense's recorder"
     return True
 
 
 def _sdk_transforms(bag: Bag, sensors: Sequence[Topic]) -> dict[str, FloatArray]:
     """Return the transform of each sensor's stream, in the first group that the left camera has."""
-    known = [t.name for t in bag.topics if t.kind == TRANSFORM and t.count]
-    first: dict[str, FloatArray] = {}
-    for message in bag.messages(known):
-        if message.topic not in first:
-            first[message.topic] = transform_of(bag.decoded(message))
+    first = _first_transforms(bag)
     found: dict[str, FloatArray] = {}
     group = None
     for sensor in sensors:
@@ -144,3 +143,13 @@ def _sdk_transforms(bag: Bag, sensors: Sequence[Topic]) -> dict[str, FloatArray]
         if group in named:
             found[sensor.name] = first[named[group]]
     return found
+
+
+def _first_transforms(bag: Bag) -> dict[str, FloatArray]:
+    """Return the first transform (4, 4) of each topic of transforms."""
+    known = [t.name for t in bag.topics if t.kind == TRANSFORM and t.count]
+    first: dict[str, FloatArray] = {}
+    for message in bag.messages(known):
+        if message.topic not in first:
+            first[message.topic] = transform_of(bag.decoded(message))
+    return first

@@ -6,10 +6,11 @@ Nothing of an image is kept but its stamp, so memory does not grow with the imag
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -49,6 +50,9 @@ _SDK_MODELS = {
 _MOVING = "/tf, "  # how the moving frames are named among the streams
 _GAP_NS = 100_000_000
 _LEVEL_SAMPLES = 8  # images looked at for black and white, spread over the recording
+
+
+_Taker: TypeAlias = Callable[[Any, Message], None]  # of the fields of a message
 
 
 @dataclass(slots=True)
@@ -293,9 +297,30 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
     index = BagIndex()
     # one has no right images
     cameras = tuple(zip(roles.cameras, (index.left, index.right), strict=False))
-    takers: dict[str, list[Callable[[Any, Message], None]]] = {
+    takers: dict[str, list[_Taker]] = {
         topic.name: [partial(_image, bag, stamps, topic)] for topic, stamps in cameras
     }
+    for name, taker in _takers_of_motion(index, roles):
+        takers.setdefault(name, []).append(taker)
+    for name in infos:
+        takers[name] = [partial(_info, index)]
+    for topic in bag.topics:
+        if topic.kind == TF and topic.name.endswith("tf_static"):
+            takers[topic.name] = [lambda fields, message: index.add_frames(fields)]
+    for message in bag.messages(list(takers)):
+        fields = bag.decoded(message)
+        for taker in takers[message.topic]:
+            taker(fields, message)
+    _settle_stamps(index, roles)
+    for images, stamps in cameras:
+        _check_one_depth(images, stamps, bag.path)
+    return index
+
+
+def _takers_of_motion(index: BagIndex, roles: Roles) -> Iterator[tuple[str, _Taker]]:
+    """Yield topic and taker of samples and poses; one odometry may be both velocity and
+    reference.
+    """
     streams = (
         (roles.imu, _gyro if roles.accel is not None else _imu),
         (roles.accel, _accel),
@@ -303,25 +328,17 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
         (roles.reference, _pose),
     )
     for topic, take in streams:
-        if topic is not None:  # one odometry may be both velocity and reference
-            takers.setdefault(topic.name, []).append(partial(take, index))
-    for name in infos:
-        takers[name] = [partial(_info, index)]
-    for name in (t.name for t in bag.topics if t.kind == TF and t.name.endswith("tf_static")):
-        takers[name] = [lambda fields, message: index.add_frames(fields)]
-    for message in bag.messages(list(takers)):
-        fields = bag.decoded(message)
-        for taker in takers[message.topic]:
-            taker(fields, message)
-    _settle_stamps(index, roles)
-    for images, stamps in cameras:
-        depths = {"16" in name for name in stamps.encodings}
-        if len(depths) > 1:
-            raise DataError(
-                f"{bag.path}: {images.name} mixes {', '.join(stamps.encodings)}; record one "
-                "encoding"
-            )
-    return index
+        if topic is not None:
+            yield topic.name, partial(take, index)
+
+
+def _check_one_depth(topic: Topic, stamps: Stamps, path: Path) -> None:
+    """Raise DataError where images of 8 and of 16 bits are mixed."""
+    depths = {"16" in name for name in stamps.encodings}
+    if len(depths) > 1:
+        raise DataError(
+            f"{path}: {topic.name} mixes {', '.join(stamps.encodings)}; record one encoding"
+        )
 
 
 def _image(bag: Bag, stamps: Stamps, topic: Topic, fields: Any, message: Message) -> None:
@@ -421,6 +438,16 @@ def _settle_stamps(index: BagIndex, roles: Roles) -> None:
     for name, rows in streams.items():
         if isinstance(rows, Rows):
             index.notes += _stamped(name, rows, behind_ns)
+    _mend_clocks(index, streams)
+    for name, rows in streams.items():
+        if isinstance(rows, Rows) and not name.startswith(_MOVING):
+            late = int((np.diff(np.array(rows.times_ns, dtype=np.int64)) < 0).sum())
+            if late:
+                index.disordered.setdefault(name, late)
+
+
+def _mend_clocks(index: BagIndex, streams: Mapping[str, Stamps | Rows]) -> None:
+    """Take out the steps of clocks that were set back, and note them."""
     usable = {
         name: rows
         for name, rows in streams.items()
@@ -434,16 +461,12 @@ def _settle_stamps(index: BagIndex, roles: Roles) -> None:
         for name, rows in usable.items()
     }
     stamps, steps = mended(arrays)
-    if steps:
-        begin_ns = min(int(logged.min()) for _, logged in arrays.values())
-        index.notes += [step.note(begin_ns) for step in steps]
-        for name, rows in usable.items():
-            rows.times_ns = stamps[name].tolist()
-    for name, rows in streams.items():
-        if isinstance(rows, Rows) and not name.startswith(_MOVING):
-            late = int((np.diff(np.array(rows.times_ns, dtype=np.int64)) < 0).sum())
-            if late and name not in index.disordered:
-                index.disordered[name] = late
+    if not steps:
+        return
+    begin_ns = min(int(logged.min()) for _, logged in arrays.values())
+    index.notes += [step.note(begin_ns) for step in steps]
+    for name, rows in usable.items():
+        rows.times_ns = stamps[name].tolist()
 
 
 def _split_mixed(index: BagIndex, roles: Roles) -> None:

@@ -27,10 +27,15 @@ def bag_files(path: Path) -> tuple[Path, ...]:
     if not path.is_dir() or _is_ros2_folder(path):
         return (path,)
     children = sorted(path.iterdir())
-    found = [child for child in children if child.suffix in _SUFFIXES and child.is_file()]
-    if found:
-        return tuple(found) if len({child.suffix for child in found}) == 1 else ()
-    return tuple(child for child in children if child.is_dir() and _is_ros2_folder(child))
+    found = tuple(child for child in children if child.suffix in _SUFFIXES and child.is_file())
+    suffixes = {child.suffix for child in found}
+    if len(suffixes) > 1:
+        return ()
+    return found or tuple(filter(_is_folder_of_ros2, children))
+
+
+def _is_folder_of_ros2(path: Path) -> bool:
+    return path.is_dir() and _is_ros2_folder(path)
 
 
 def _is_ros2_folder(path: Path) -> bool:

@@ -65,33 +65,42 @@ def raw_gray(fields: Any, where: str, *, colour: bool = False) -> npt.NDArray[An
     row = int(fields.step)
     needed = width * channels * dtype.itemsize
     data = np.frombuffer(bytes(fields.data), dtype=np.uint8)
-    if not (width > 0 and height > 0 and row >= needed and len(data) >= row * height):
-        raise UnreadableImageError(
-            f"{where}: {len(data)} bytes are not {width} x {height} pixels of {encoding} in rows "
-            f"of {row}; the "
-            "message is truncated"
-        )
+    _check_whole(len(data), (height, width, row), needed, encoding, where)
     rows = np.ascontiguousarray(data[: row * height].reshape(height, row)[:, :needed])
     pixels = rows.view(dtype).astype(np.dtype(depth), copy=False).reshape(height, width, channels)
     to = "RGB" if colour else "GRAY"
     if bayer:
-        return np.asarray(
-            cv2.cvtColor(pixels[..., 0], getattr(cv2, f"COLOR_Bayer{_BAYER[encoding[6:10]]}2{to}"))
-        )
+        code = f"COLOR_Bayer{_BAYER[encoding[6:10]]}2{to}"
+        return np.asarray(cv2.cvtColor(pixels[..., 0], getattr(cv2, code)))
     if yuv is not None:
         return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_YUV2{to}_{yuv}")))
     if channels == 1:
         return pixels[..., 0]
-    name = (
-        encoding.rstrip("0123456789").upper()
-        if not encoding[:1].isdigit()
-        else {3: "BGR", 4: "BGRA"}[channels]
-    )
-    return (
-        pixels
-        if name == to
-        else np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{name}2{to}")))
-    )
+    order = _channel_order(encoding, channels)
+    if order == to:
+        return pixels
+    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{order}2{to}")))
+
+
+def _check_whole(
+    size: int, shape: tuple[int, int, int], least: int, encoding: str, where: str
+) -> None:
+    """Raise UnreadableImageError where a message has fewer bytes than its image of rows of a length,
+    height, width and bytes a row, which are `least` or more.
+    """
+    height, width, row = shape
+    if min(width, height) < 1 or row < least or size < row * height:
+        raise UnreadableImageError(
+            f"{where}: {size} bytes are not {width} x {height} pixels of {encoding} in rows "
+            f"of {row}; the message is truncated"
+        )
+
+
+def _channel_order(encoding: str, channels: int) -> str:
+    """Return the order of the colours, as OpenCV names it: that of `rgb8`, BGR of `8UC3`."""
+    if encoding[:1].isdigit():
+        return {3: "BGR", 4: "BGRA"}[channels]
+    return encoding.rstrip("0123456789").upper()
 
 
 def _form(encoding: str, where: str, *, bayer: bool, yuv: str | None) -> tuple[str, int]:

@@ -113,21 +113,15 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
             "--calibration FILE with T_cam_imu (Kalibr's camchain-imucam), or record /tf_static"
         )
     stamps = (index.left, index.right)[: len(roles.cameras)]
-    times_ns, keys, image_notes = _frames(stamps, [topic.name for topic in roles.cameras], path)
+    topics = [topic.name for topic in roles.cameras]
+    times_ns, keys, image_notes = _frames(stamps, topics, path)
     logged_ns = np.min([key[:, 1] for key in keys], axis=0)
     with naming(file or path):
         rectifier = rig.rectifier(settings.interpolation, settings.projection)
     motion, motion_notes = motion_of(found, rig, times_ns)
     truth = index.reference(imu=rig.T_cam0_imu is not None)
     levels = levels_of([*index.left.bands, *index.right.bands])
-    level_notes = [
-        *levels.note,
-        *(
-            mosaic_note(f"{path}, {topic.name}")
-            for topic, images in zip(roles.cameras, stamps, strict=True)
-            if images.mosaic
-        ),
-    ]
+    level_notes = [*levels.note, *_mosaic_notes(stamps, topics, path)]
     recording = Recording(
         kind="bag",
         path=path,
@@ -152,6 +146,15 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
     )
 
 
+def _mosaic_notes(images: Sequence[Stamps], topics: Sequence[str], path: Path) -> list[str]:
+    """Return a note for each topic whose images are a mosaic of colours said to be gray."""
+    return [
+        mosaic_note(f"{path}, {topic}")
+        for topic, stamps in zip(topics, images, strict=True)
+        if stamps.mosaic
+    ]
+
+
 def _frames(
     images: Sequence[Stamps], names: Sequence[str], path: Path
 ) -> tuple[IntArray, tuple[IntArray, ...], list[str]]:
@@ -163,26 +166,30 @@ def _frames(
     keys = [_keys(stamps)[each[1]] for stamps, each in zip(images, ordered, strict=True)]
     if not all(len(each) for each in times):
         raise DataError(f"{path}: no image could be read of {' and '.join(names)}; copy it again")
-    notes = [
-        f"the headers of {name} have no stamps; the times of logging are used, which jitter"
-        for name, stamps in zip(names, images, strict=True)
-        if stamps.unstamped
-    ]
-    twice = [each[2] for each in ordered]
-    if any(twice):
-        which = f"{twice[0]}" if len(twice) == 1 else f"{twice[0]} left and {twice[1]} right"
-        notes.append(f"{which} images repeat a stamp and are skipped")
+    notes = _stamp_notes(images, names, [each[2] for each in ordered])
     if len(images) == 1:
         return times[0], (keys[0],), notes
     left, right = times
     if images[0].unstamped != images[1].unstamped:
         a, b = _paired_by_logging(keys[0][:, 1], keys[1][:, 1])
-        stamped = left if images[1].unstamped else right
-        rows = a if images[1].unstamped else b
+        stamped_ns = left[a] if images[1].unstamped else right[b]
         notes.append("the images are paired by their times of logging")
-        return stamped[rows], (keys[0][a], keys[1][b]), notes
+        return stamped_ns, (keys[0][a], keys[1][b]), notes
     a, b, differing = paired(left, right, names, path)
     return left[a], (keys[0][a], keys[1][b]), [*notes, *differing]
+
+
+def _stamp_notes(images: Sequence[Stamps], names: Sequence[str], twice: Sequence[int]) -> list[str]:
+    """Return what is said of the stamps of one or two topics, of which some images repeat one."""
+    notes = [
+        f"the headers of {name} have no stamps; the times of logging are used, which jitter"
+        for name, stamps in zip(names, images, strict=True)
+        if stamps.unstamped
+    ]
+    if any(twice):
+        which = f"{twice[0]}" if len(twice) == 1 else f"{twice[0]} left and {twice[1]} right"
+        notes.append(f"{which} images repeat a stamp and are skipped")
+    return notes
 
 
 def _keys(stamps: Stamps) -> IntArray:

@@ -5,7 +5,7 @@ named.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from vio.datasets.bags.store import Topic
@@ -102,16 +102,21 @@ def choose(topics: Sequence[Topic], named: str | None, where: str) -> tuple[Role
     reference = given["reference"] if "reference" in given else _reference(filled, notes)
     velocity = given.get("velocity")
     if "velocity" not in given and imu is None:
-        moving = [t for t in filled if t.kind in (ODOMETRY, *TWISTS) and t != reference]
-        velocity = moving[0] if len(moving) == 1 else None
+        velocity = _only_velocity(filled, reference)
     roles = Roles(left, right, imu, accel, velocity, reference)
     return roles, (*notes, *_not_used(topics, roles))
 
 
+def _only_velocity(filled: Sequence[Topic], reference: Topic | None) -> Topic | None:
+    """Return the topic of velocities that is not the reference; None: there is none, or several."""
+    moving = [t for t in filled if t.kind in (ODOMETRY, *TWISTS) and t != reference]
+    return moving[0] if len(moving) == 1 else None
+
+
 def _named(topics: Sequence[Topic], named: str | None, where: str) -> dict[str, Topic | None]:
+    """Return the topics that are named by role; None: the role is left out."""
     if named is None:
         return {}
-    by_name = {t.name: t for t in topics}
     given: dict[str, Topic | None] = {}
     for part in named.split(","):
         role, equals, name = (x.strip() for x in part.partition("="))
@@ -119,26 +124,33 @@ def _named(topics: Sequence[Topic], named: str | None, where: str) -> dict[str, 
             raise DataError(
                 f"--topics {named!r}: {part!r} is no ROLE=/TOPIC; roles are {', '.join(_ROLES)}"
             )
-        if name == "none" and role != "left":
-            given[role] = None
-            continue
-        topic = by_name.get(name) or by_name.get(f"/{name}")
-        if topic is None:
-            fit = [t.name for t in topics if t.kind in _ROLES[role] and t.count]
-            raise DataError(
-                f"{where}: holds no topic {name!r} for {role}; those of its type are {listed(fit)}"
-            )
-        if topic.kind not in _ROLES[role]:
-            raise DataError(
-                f"{where}: {name} holds {topic.kind}, not {' or '.join(_ROLES[role])} as {role} "
-                "must"
-            )
-        if not topic.count:
-            raise DataError(
-                f"{where}: {name} ({role}) holds no message; name another topic, or another bag"
-            )
-        given[role] = topic
+        left_out = name == "none" and role != "left"
+        given[role] = None if left_out else _topic_for(role, name, topics, where)
     return given
+
+
+def _topic_for(role: str, name: str, topics: Sequence[Topic], where: str) -> Topic:
+    """Return the topic of a name, with or without the slash in front.
+
+    Raises:
+        DataError: there is none, or it is empty or of another type than its role takes.
+    """
+    by_name = {t.name: t for t in topics}
+    topic = by_name.get(name) or by_name.get(f"/{name}")
+    if topic is None:
+        fit = [t.name for t in topics if t.kind in _ROLES[role] and t.count]
+        raise DataError(
+            f"{where}: holds no topic {name!r} for {role}; those of its type are {listed(fit)}"
+        )
+    if topic.kind not in _ROLES[role]:
+        raise DataError(
+            f"{where}: {name} holds {topic.kind}, not {' or '.join(_ROLES[role])} as {role} must"
+        )
+    if not topic.count:
+        raise DataError(
+            f"{where}: {name} ({role}) holds no message; name another topic, or another bag"
+        )
+    return topic
 
 
 def _cameras(
@@ -148,27 +160,37 @@ def _cameras(
 
     None in the place of the right one where there is one camera.
     """
-    images = [t for t in filled if t.kind in (IMAGE, COMPRESSED) and not _NO_GRAY.search(t.name)]
+    images = list(filter(_may_be_gray, filled))
     left_named = given.get("left")
-    cameras = images if left_named is None or left_named in images else [*images, left_named]
-    alone, others = _one_camera(cameras)
+    named = [t for t in (left_named,) if t is not None and t not in images]
+    alone, others = _one_camera([*images, *named])
     if alone is not None and given.get("right") is None:
-        if others and left_named is None:
+        if left_named is not None:
+            return left_named, None
+        if others:
             same = f"{alone.name} is taken; {listed(others)} shows the same camera"
             notes.append(f"{same} (choose with --topics left=/NAME)")
-        return left_named or alone, None
+        return alone, None
+    _check_pair_possible(images, given, where)
+    return _pair(images, given, where)
+
+
+def _may_be_gray(topic: Topic) -> bool:
+    return topic.kind in (IMAGE, COMPRESSED) and not _NO_GRAY.search(topic.name)
+
+
+def _check_pair_possible(
+    images: Sequence[Topic], given: dict[str, Topic | None], where: str
+) -> None:
+    """Raise DataError where no right image is wanted, or there are less than two."""
+    have = listed([t.name for t in images])
     if "right" in given and given["right"] is None:
-        raise DataError(
-            f"{where}: of {listed([t.name for t in images])}, name the camera: --topics "
-            "left=/A,right=none"
-        )
+        raise DataError(f"{where}: of {have}, name the camera: --topics left=/A,right=none")
     if len(images) < 2:
-        have = listed([t.name for t in images])
         needed = "stereo needs two" if images else "one camera needs one, stereo two"
         raise DataError(
             f"{where}: holds {len(images)} image topics with messages ({have}); {needed}"
         )
-    return _pair(images, given, where)
 
 
 def _pair(
@@ -184,17 +206,20 @@ def _pair(
         if given.get(role) is not None:
             pairs = [p for p in pairs if p[k] == given[role]]
     if len(pairs) > 1:
-        best = min(_rank(left) for left, _ in pairs)
-        pairs = [p for p in pairs if _rank(p[0]) == best]
-    if len(pairs) != 1:
-        what = (
-            "several topics could be the pair"
-            if pairs
-            else "no two topics are named as left and right"
-        )
-        names = listed([t.name for t in images])
-        raise DataError(f"{where}: {what} ({names}); name them with --topics left=/A,right=/B")
-    return pairs[0]
+        pairs = _best_ranked(pairs)
+    if len(pairs) == 1:
+        return pairs[0]
+    what = "no two topics are named as left and right"
+    if pairs:
+        what = "several topics could be the pair"
+    names = listed([t.name for t in images])
+    raise DataError(f"{where}: {what} ({names}); name them with --topics left=/A,right=/B")
+
+
+def _best_ranked(pairs: Sequence[tuple[Topic, Topic]]) -> list[tuple[Topic, Topic]]:
+    """Return the pairs whose left topic ranks first; several may."""
+    best = min(_rank(left) for left, _ in pairs)
+    return [pair for pair in pairs if _rank(pair[0]) == best]
 
 
 def _named_as_pairs(images: Sequence[Topic]) -> list[tuple[Topic, Topic]]:
@@ -239,15 +264,38 @@ def _imu(
 ) -> tuple[Topic | None, Topic | None]:
     """Choose the topic of the IMU, or those of gyro and accelerometer where no topic has both."""
     named = given.get("imu")
-    if "imu" in given and (named is None or "accel" in given or _sensor_of(named) != "gyro"):
-        return named, given.get("accel")
-    sensors = [t for t in filled if t.kind == IMU or (t.kind == VECTOR and _sensor_of(t))]
-    both = _of_sensor(sensors, "") if named is None else []
-    gyros = _of_sensor(sensors if named is None else [named], "gyro")
     accel_named = given.get("accel")
+    if "imu" in given and not _lacks_accel(given):
+        return named, accel_named
+    sensors = list(filter(_may_be_imu, filled))
+    both: Sequence[Topic] = ()
+    if named is None:
+        both = _of_sensor(sensors, "")
+    gyros = _of_sensor(sensors if named is None else [named], "gyro")
     accels = _of_sensor(sensors, "accel") if accel_named is None else [accel_named]
-    if both or not (gyros and accels):
-        return _single([t for t in both or gyros if t.kind == IMU], left, notes), None
+    if gyros and accels and not both:
+        return _joined_imu(gyros, accels, left, notes)
+    return _single(_of_kind(both or gyros, IMU), left, notes), None
+
+
+def _of_kind(topics: Sequence[Topic], kind: str) -> list[Topic]:
+    return [topic for topic in topics if topic.kind == kind]
+
+
+def _lacks_accel(given: Mapping[str, Topic | None]) -> bool:
+    """Tell whether the topic named for the IMU is a gyro, and none is named for the accelerometer."""
+    named = given.get("imu")
+    return named is not None and "accel" not in given and _sensor_of(named) == "gyro"
+
+
+def _may_be_imu(topic: Topic) -> bool:
+    return topic.kind == IMU or (topic.kind == VECTOR and bool(_sensor_of(topic)))
+
+
+def _joined_imu(
+    gyros: Sequence[Topic], accels: Sequence[Topic], left: Topic, notes: list[str]
+) -> tuple[Topic, Topic]:
+    """Choose the gyro that is named most as the left camera, and the accelerometer named as it."""
     gyro = max(gyros, key=lambda t: (_shared(t.name, left.name), t.count))
     accel = max(accels, key=lambda t: (_shared(t.name, gyro.name), t.count))
     notes.append(

@@ -61,14 +61,21 @@ def read_bare(path: Path, size: Size | None) -> Rig:
 
 def _numbers(path: Path) -> FloatArray | None:
     """Return one row of 4, 8 or 9 numbers, or a matrix; None: the file holds something else."""
-    lines = [line.strip() for _, line in text_lines(path) if line.strip()[:1] not in ("#", "")]
-    if any(_DECIMAL_COMMAS.fullmatch(line) for line in lines):
-        lines = [line.replace(",", ".") for line in lines]
-    try:
-        rows = [[float(x) for x in re.split(r"[\s,;]+", line) if x] for line in lines[:5]]
-    except ValueError:
+    rows = _rows_of_numbers(path)
+    if rows is None:
         return None
     widths = {len(row) for row in rows}
     one = len(rows) == 1 and widths <= {4, 8, 9}
     square = widths in ({3}, {4}) and len(rows) in widths
     return np.array(rows) if one or square else None
+
+
+def _rows_of_numbers(path: Path) -> list[list[float]] | None:
+    """Return the first five lines that are no comments; None: they hold something else."""
+    lines = [line.strip() for _, line in text_lines(path) if line.strip()[:1] not in ("#", "")]
+    if any(_DECIMAL_COMMAS.fullmatch(line) for line in lines):
+        lines = [line.replace(",", ".") for line in lines]
+    try:
+        return [[float(x) for x in re.split(r"[\s,;]+", line) if x] for line in lines[:5]]
+    except ValueError:
+        return None

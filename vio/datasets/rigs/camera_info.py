@@ -113,18 +113,21 @@ def pair_of_files(path: Path) -> tuple[Path, Path] | None:
     None: there is no pair, or several.
     """
     folder = path if path.is_dir() else path.parent
-    names = sorted(
-        file.name
-        for file in folder.iterdir()
-        if file.suffix in (".yaml", ".yml") and file.is_file()
-    )
-    pairs = pairs_of(names)
+    pairs = pairs_of(sorted(file.name for file in filter(_is_yaml, folder.iterdir())))
     if path.is_dir():
-        found = [p for p in pairs if all(_holds_camera_info(folder / name) for name in p)]
+        found = [
+            (left, right)
+            for left, right in pairs
+            if _holds_camera_info(folder / left) and _holds_camera_info(folder / right)
+        ]
     else:
         found = [pair for pair in pairs if path.name in pair]
     pair = first_pair(found)
     return None if pair is None else (folder / pair[0], folder / pair[1])
+
+
+def _is_yaml(file: Path) -> bool:
+    return file.suffix in (".yaml", ".yml") and file.is_file()
 
 
 def _holds_camera_info(file: Path) -> bool:
@@ -221,29 +224,14 @@ def rig_from_camera_infos(
 
 def _rig(infos: Sequence[CameraInfo], *, rectified: bool) -> Rig:
     if len(infos) == 1:
-        K, name = (infos[0].P[:, :3], "P") if rectified else (infos[0].K, "K")
-        if not K[0, 0] > 0:
-            raise CalibrationError(
-                f"{infos[0].where}: not calibrated ({name} is zero); give a calibration file"
-            )
-        return Rig(_camera(infos[0], rectified=rectified))
+        return _mono_rig(infos[0], rectified=rectified)
     for info in infos:
         if not (info.K[0, 0] > 0 and info.P[0, 0] > 0):
             raise CalibrationError(
                 f"{info.where}: not calibrated (K or P is zero); give a calibration file"
             )
     left, right = infos
-    offsets = [np.linalg.solve(info.P[:, :3], info.P[:, 3]) for info in infos]
-    shift = offsets[1] - offsets[0]  # rectified left to rectified right
-    if (fault := vertical_fault(shift)) is not None:
-        raise CalibrationError(f"{right.where}: {fault}")
-    if not shift[0] < 0:
-        raise CalibrationError(
-            f"{right.where}: P gives a stereo baseline of {-shift[0]:g} m, not a positive one "
-            "(P[0, 3] of the right "
-            "camera is -focal * baseline); the cameras are swapped, or were not calibrated as a "
-            "pair"
-        )
+    shift = _rectified_shift(left, right)
     if rectified:
         cam = _camera(left, rectified=True)
         with naming(left.where):
@@ -256,6 +244,35 @@ def _rig(infos: Sequence[CameraInfo], *, rectified: bool) -> Rig:
     )
     cam0, cam1 = (_camera(info, rectified=False) for info in infos)
     return Rig(cam0, cam1, se3_from_parts(R1.T @ R0, R1.T @ shift))
+
+
+def _mono_rig(info: CameraInfo, *, rectified: bool) -> Rig:
+    K, name = (info.P[:, :3], "P") if rectified else (info.K, "K")
+    if not K[0, 0] > 0:
+        raise CalibrationError(
+            f"{info.where}: not calibrated ({name} is zero); give a calibration file"
+        )
+    return Rig(_camera(info, rectified=rectified))
+
+
+def _rectified_shift(left: CameraInfo, right: CameraInfo) -> FloatArray:
+    """Return the translation (3,) from the rectified left to the rectified right camera in m.
+
+    Raises:
+        CalibrationError: it is none of a pair, or the cameras are swapped.
+    """
+    offsets = [np.linalg.solve(info.P[:, :3], info.P[:, 3]) for info in (left, right)]
+    shift: FloatArray = offsets[1] - offsets[0]
+    if (fault := vertical_fault(shift)) is not None:
+        raise CalibrationError(f"{right.where}: {fault}")
+    if not shift[0] < 0:
+        raise CalibrationError(
+            f"{right.where}: P gives a stereo baseline of {-shift[0]:g} m, not a positive one "
+            "(P[0, 3] of the right "
+            "camera is -focal * baseline); the cameras are swapped, or were not calibrated as a "
+            "pair"
+        )
+    return shift
 
 
 def _camera(info: CameraInfo, *, rectified: bool) -> CameraModel:

@@ -192,10 +192,8 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
         return read_four_seasons(path, image_size)
     if path.name == eth3d.EXTRINSICS:
         return eth3d.read_eth3d(path, image_size)
-    if suffix == ".txt" and bare.is_bare(path):
-        return bare.read_bare(path, image_size)
     if suffix == ".txt":
-        return kitti_rig(path, image_size)[0]
+        return _read_txt(path, image_size)
     if suffix == ".xml" and is_boofcv(path):
         return read_boofcv(path)
     entries = _entries(path)
@@ -203,6 +201,12 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
         if fits(entries):
             return read(Source(path, entries, image_size, cameras))
     raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
+
+
+def _read_txt(path: Path, image_size: Size | None) -> Rig:
+    if bare.is_bare(path):
+        return bare.read_bare(path, image_size)
+    return kitti_rig(path, image_size)[0]
 
 
 def _is_sensor_sheet(entries: Entries) -> bool:

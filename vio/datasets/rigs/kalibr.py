@@ -67,14 +67,13 @@ def read_camchain(path: Path) -> Rig:
     T_cam0_imu = _imu_pose(blocks[0], where[0])
     notes: list[str] = []
     T_cam1_cam0 = _stereo_pose(blocks[1], T_cam0_imu, path, notes) if "cam1" in names else None
-    if further := sorted(name for name in entries if name.startswith("cam") and name not in names):
-        notes.append(f"{path}: {' and '.join(names)} are used, {', '.join(further)} not")
+    notes += _further_cameras(entries, names, path)
     noise, imu_notes = _imu_beside(path)
     offset_s = _time_shift(blocks, where)
     residual_px = _residual(blocks[-1], where[-1])
-    factor = (
-        numbers(blocks[0], "depth_factor", where[0], 1)[0] if "depth_factor" in blocks[0] else None
-    )
+    factor = None
+    if "depth_factor" in blocks[0]:
+        factor = numbers(blocks[0], "depth_factor", where[0], 1)[0]
     with naming(path):
         notes += imu_notes
         rig = Rig(
@@ -89,6 +88,14 @@ def read_camchain(path: Path) -> Rig:
             factor,
         )
     return checked_rig(rig, path)
+
+
+def _further_cameras(entries: Entries, names: Sequence[str], path: Path) -> list[str]:
+    """Return a note on the cameras that are not used, where there are some."""
+    further = sorted(name for name in entries if name.startswith("cam") and name not in names)
+    if not further:
+        return []
+    return [f"{path}: {' and '.join(names)} are used, {', '.join(further)} not"]
 
 
 def _stereo_pose(
@@ -218,20 +225,25 @@ def _imu_beside(path: Path) -> tuple[ImuDensities | None, tuple[str, ...]]:
     for file in sorted([*path.parent.glob("*imu*.yaml"), *path.parent.glob("*imu*.yml")]):
         if "chain" in file.name.replace("imu_chain", "") or file == path or not file.is_file():
             continue
-        try:
-            entries = read_yaml_file(file, "Kalibr's IMU noise")
-        except DataError:
-            continue
-        block = entries.get("imu0")  # plain, or a block for each IMU
-        noise = imu_densities(
-            {str(k): v for k, v in block.items()} if isinstance(block, dict) else entries, file
-        )
+        noise = _noise_in(file)
         if noise is not None:
             found.append((file, noise))
     if not found:
         return None, ()
     names = ", ".join(file.name for file, _ in found)
     return found[0][1], (f"of {names} the first gives the IMU's noise",) if len(found) > 1 else ()
+
+
+def _noise_in(file: Path) -> ImuDensities | None:
+    """Return the noise that a YAML file states, plain or in the block of its first IMU."""
+    try:
+        entries = read_yaml_file(file, "Kalibr's IMU noise")
+    except DataError:
+        return None
+    block = entries.get("imu0")
+    if isinstance(block, dict):
+        entries = {str(k): v for k, v in block.items()}
+    return imu_densities(entries, file)
 
 
 def kalibr_text(rig: Rig) -> str:

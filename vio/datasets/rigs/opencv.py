@@ -99,19 +99,16 @@ def rig_from_opencv(entries: Entries, where: str, image_size: tuple[int, int] | 
 def _raw(entries: Entries, where: str, width: int, height: int) -> Rig:
     K0, K1 = (_required(entries, key, (3, 3), where) for key in ("K0", "K1"))
     stated = entries.get("distortion_model", entries.get("camera_model", entries.get("model")))
-    named = stated is not None and str(stated).lower() != "pinhole"  # that is the projection
-    model = lens_model(stated, where) if named else "radtan"
+    model = _stated_model(stated, where)
     notes: list[str] = []
     cameras = []
     for K, key, mirror in ((K0, "D0", "xi0"), (K1, "D1", "xi1")):
         found = _find(entries, key)
+        D: tuple[float, ...] = ()
         if found is None:
             notes.append(_no_distortion(entries, where))
-        D = (
-            ()
-            if found is None
-            else tuple(np.ravel(matrix(found, None, f"{where}, {_name(entries, key)}")).tolist())
-        )
+        else:
+            D = tuple(matrix(found, None, f"{where}, {_name(entries, key)}").ravel().tolist())
         lens = model
         if _find(entries, mirror) is not None:
             xi = float(_required(entries, mirror, (1, 1), where)[0, 0])
@@ -128,6 +125,13 @@ def _raw(entries: Entries, where: str, width: int, height: int) -> Rig:
     pose = _stereo_pose(entries, where)
     with naming(where):
         return Rig(cameras[0], cameras[1], pose, notes=tuple(dict.fromkeys(notes)))
+
+
+def _stated_model(stated: object, where: str) -> DistortionModel:
+    """Return the lens model of a name; that of OpenCV where there is none but the projection's."""
+    if stated is None or str(stated).lower() == "pinhole":
+        return "radtan"
+    return lens_model(stated, where)
 
 
 def _no_distortion(entries: Entries, where: str) -> str:
