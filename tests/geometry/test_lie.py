@@ -314,3 +314,10 @@ def test_what_is_not_finite_stays_so_without_an_error() -> None:
         for value in (np.nan, np.inf):
             assert not np.isfinite(lie.so3_exp([value, 0.0, 0.0])).all()
             assert not np.isfinite(lie.so3_log(np.full((3, 3), value))).all()
+
+
+def test_lengths_are_those_of_numpy_to_the_bit() -> None:
+    vectors = np.random.default_rng(0).normal(size=(500, 2))
+    np.testing.assert_array_equal(lie.lengths(vectors), np.linalg.norm(vectors, axis=1))
+    for vector in np.random.default_rng(1).normal(size=(100, 3)):
+        assert lie.length(vector) == np.linalg.norm(vector)
