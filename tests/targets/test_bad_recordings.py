@@ -138,6 +138,7 @@ CHARUCO = "target_type: charuco\nsquaresX: 5\nsquaresY: 7\nsquareSize: 0.04\nmar
 
 BAD_TARGETS = {
     "fewer columns": (TEXT.replace("tagCols: 4", "tagCols: 3"), "rows of 4 tags, .* says 3"),
+    "many columns": (TEXT.replace("tagCols: 4", "tagCols: 99"), "rows of 4 tags, .* says 99"),
     "other spacing": (
         TEXT.replace("tagSpacing: 0.3", "tagSpacing: 0.2"),
         "tagSpacing is about 0.3 in the images, and 0.2 in the target file",
@@ -145,7 +146,10 @@ BAD_TARGETS = {
     "other numbers": (TEXT + "codeOffset: 20\n", "an AprilGrid with tags 0 to 11"),
     "other family": (TEXT + "tagFamily: t16h5\n", "'tagFamily' is 't16h5', .* tags of 36h11"),
     "dictionary": (TEXT + "dictionary: DICT_4X4_50\n", "'dictionary' is 'DICT_4X4_50'"),
-    "too many tags": (TEXT.replace("Cols: 4", "Cols: 99"), "36h11 has 587 markers"),
+    "too many tags": (
+        TEXT.replace("Cols: 4", "Cols: 99").replace("Rows: 3", "Rows: 9"),
+        "36h11 has 587 markers",
+    ),
     "true": (TEXT.replace("tagCols: 4", "tagCols: true"), "'tagCols' is True, no number"),
     "no dictionary": (CHARUCO + "dictionary: DICT_4X4_51\n", "such as DICT_4X4_50 or DICT_"),
     "no size": (CHARUCO.replace("0.04", "0"), "'squareSize' is 0, no length in metres"),

@@ -17,7 +17,7 @@ from vio.records import ImuDensities, IntArray
 from vio.targets.bundle import Adjusted, BoardAdjustment
 from vio.targets.corners import Corners
 from vio.targets.description import Target
-from vio.targets.diagnosis import diagnose
+from vio.targets.diagnosis import clearly_other_board, diagnose
 from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
 from vio.targets.lenses import LENSES, LensChoice, Rival, choose_lens, rivals_of
 from vio.targets.recording import Filmed
@@ -219,6 +219,9 @@ def _check_views(filmed: Filmed, target: Target) -> None:
                 f"differ, and {MIN_VIEWS} are needed: move the board or the camera between the images, nearer "
                 "and farther, and tilt it"
             )
+        images = [images[c] for images in filmed.samples]
+        if (other := clearly_other_board(images, target)) is not None:
+            raise DataError(f"{name} camera: {other}")
     together = sum(min(map(len, view.corners)) >= _MIN_CORNERS for view in filmed.views)
     if together < MIN_VIEWS // 2:
         raise DataError(

@@ -51,6 +51,8 @@ def diagnose(images: Sequence[Image], target: Target) -> str | None:
         images: some of a recording, (H, W) each.
         target: the board as described.
     """
+    if not images:
+        return None
     detector = CornerDetector(target)
     found = [len(detector.detect(image)) for image in images]
     seen = sum(found)
@@ -98,14 +100,27 @@ def _glare(images: Sequence[Image]) -> str | None:
     )
 
 
-def _other_arrangement(images: Sequence[Image], target: Target) -> str | None:
-    """Say in which rows and at which distances the markers stand, where not as described."""
+def clearly_other_board(images: Sequence[Image], target: Target) -> str | None:
+    """Return how the markers are arranged, where the described board cannot be that of the images.
+
+    Corners alone do not show it: those in the first row agree with any number of columns.
+    """
+    if target.kind == "checkerboard":
+        return None
+    return _other_arrangement(images, target, _MAX_MISFIT)
+
+
+def _other_arrangement(
+    images: Sequence[Image], target: Target, min_misfit: float = 0.0
+) -> str | None:
+    """Say in which rows and at which distances the markers are, where not as described."""
     read = _close_together(_most_read(images, _with_more_markers(target)))
     if len(read) < _MIN_MARKERS:
         return None
     best = min(_arrangements(target), key=lambda other: _misfit(read, other))
     misfit = _misfit(read, best)
-    if misfit > _MAX_MISFIT or misfit > _MUCH_BETTER * _misfit(read, target):
+    described = _misfit(read, target)
+    if described < min_misfit or misfit > _MAX_MISFIT or misfit > _MUCH_BETTER * described:
         return None
     if best.cols != target.cols:
         one = "tags" if target.kind == "aprilgrid" else "squares"
@@ -142,7 +157,9 @@ def _most_read(images: Sequence[Image], target: Target) -> list[Read]:
 
 
 def _refined(image: Image, read: Sequence[Read]) -> list[Read]:
-    """Return markers whose corners are where the image has theirs."""
+    """Return markers whose corners are where the image has theirs; none that it cuts."""
+    limit = np.array(image.shape[::-1]) - 1
+    read = [one for one in read if (one.uv >= 0).all() and (one.uv <= limit).all()]
     half_px = [max(_WINDOW_SHARE * one.side_px, 2.0) for one in read]
     return [
         replace(one, uv=subpixel(image, one.uv, int(half)))

@@ -34,7 +34,7 @@ _MIRRORED = InertialFinding(
     "of its columns",
 )
 
-_STILL_SHARE = 0.1  # of the rates seen, below which those of the gyro are noise
+_STILL_SHARE = 0.05  # of the rates seen and of gravity, below which the IMU's readings are noise
 _STILL = InertialFinding(
     "gyro disagrees",
     "the IMU does not turn while the board turns before the camera",
@@ -131,11 +131,13 @@ def _judge(record: Record, gyro_fit: GyroFit, size: Size) -> list[InertialFindin
 
 
 def _is_still(record: Record) -> bool:
-    """Return whether the gyro does not turn while the board turns before the camera."""
-    readings, _ = record.means(np.zeros(1))
-    own = readings[0, :, :3] - np.median(readings[0, :, :3], axis=0)
+    """Return whether neither sensor of the IMU moves while the board turns before the camera."""
+    readings = record.means(np.zeros(1))[0][0]
+    usual = np.median(readings, axis=0)
+    turn, push = np.linalg.norm((readings - usual).reshape(-1, 2, 3), axis=2).T
     seen = np.linalg.norm(record.twists[:, 3:], axis=1)
-    return median(np.linalg.norm(own, axis=1)) < _STILL_SHARE * median(seen)
+    rests = median(push) < _STILL_SHARE * np.linalg.norm(usual[3:])
+    return bool(rests and median(turn) < _STILL_SHARE * median(seen))
 
 
 def _disagreement(gyro_fit: GyroFit) -> InertialFinding:
