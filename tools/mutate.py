@@ -30,6 +30,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tools.measures import number_constants
 from tools.parts import source_files
@@ -151,13 +152,16 @@ def _larger(text: str) -> Iterator[tuple[str, str, str]]:
         if not isinstance(target, ast.Name) or target.id not in numbers or not (old and value):
             continue
         number = eval(compile(ast.Expression(node.value), "", "eval"), {})  # of numbers alone
-        larger = tuple(map(_half_more, number)) if isinstance(number, tuple) else _half_more(number)
+        larger = _half_more(number)
         if larger != number:
             indent = "\n" + " " * node.col_offset
             yield target.id, f"{indent}{old}", f"{indent}{old.removesuffix(value)}{larger!r}"
 
 
-def _half_more(number: float) -> float:
+def _half_more(number: Any) -> Any:
+    """Return a number, or each of a tuple, half as large again."""
+    if isinstance(number, tuple):
+        return tuple(map(_half_more, number))
     if isinstance(number, int):
         return number + (max(1, abs(number) // 2) if number > 0 else -(abs(number) // 2))
     return 1.5 * number

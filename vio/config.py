@@ -43,8 +43,8 @@ MotionName = Literal["auto", "imu", "velocity", "none"]
 BASIC = (
     "motion", "backend", "lag_frames", "frontend.name", "frontend.features", "frontend.grid.target_features",
     "frontend.disparity.max_disparity", "frontend.klt.mask", "frontend.klt.equalise", "selector.name",
-    "selector.budget", "msckf.clones", "msckf.max_landmarks", "imu.gravity_mps2", "imu.gyro_noise_density",
-    "imu.accel_noise_density", "imu.gyro_bias_walk", "imu.accel_bias_walk", "msckf.calibrate_camera_imu",
+    "selector.budget", "imu.gravity_mps2", "imu.gyro_noise_density", "imu.accel_noise_density", "imu.gyro_bias_walk",
+    "imu.accel_bias_walk", "msckf.clones", "msckf.max_landmarks", "msckf.calibrate_camera_imu",
     "msckf.calibrate_stereo",
 )  # fmt: skip
 # Former settings: renamed, whose values are still taken, and constants of the code today, for the
@@ -109,9 +109,9 @@ class Config(Section):
         at_most=100,
     )
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
-    imu: ImuSettings = field(default_factory=ImuSettings)
     frontend: FrontendSettings = field(default_factory=FrontendSettings)
     selector: SelectorSettings = field(default_factory=SelectorSettings)
+    imu: ImuSettings = field(default_factory=ImuSettings)
     vislam: VislamSettings = field(default_factory=VislamSettings)
     msckf: MsckfSettings = field(default_factory=MsckfSettings)
 

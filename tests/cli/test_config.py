@@ -206,9 +206,10 @@ def test_takes_a_setting_by_its_former_name_and_says_the_new_one(
     path.write_text(f"{section}:\n  clones: 9\n  {name}: {value}\n")
     expected = load_config(None, [f"{new}={value}", "msckf.clones=9"])
     assert load_config(path) == load_config(None, [f"{old}={value}", "msckf.clones=9"]) == expected
-    assert [record.getMessage().partition(": ")[2][:-10] for record in caplog.records] == [
-        f"'{old}' is '{new}' since {'0.3' if 'calibrate' in old else '0.4'}"
-    ] * 2
+    version = "0.3" if old == "msckf.calibrate" else "0.4"
+    said = f"'{old}' is '{new}' since {version}; rename it"
+    messages = [record.getMessage() for record in caplog.records]
+    assert messages == [f"{path}: {said}", f"--set {old}={value}: {said}"]
 
 
 def test_refuses_a_setting_by_both_of_its_names(tmp_path: Path) -> None:

@@ -72,6 +72,7 @@ def test_constants_are_made_half_as_large_again(tmp_path: Path) -> None:
 _ONE = 1  # at least one more
 _SHARE: float = 0.5
 _PAIR = (-4, 2.0)
+_GRID = ((1, 2), (3, 4))
 _ZERO = 0
 _NAME = "1"
 
@@ -95,10 +96,11 @@ _RULES = _Rules()
         ("\n_ONE = 1", "\n_ONE = 2"),
         ("\n_SHARE: float = 0.5", "\n_SHARE: float = 0.75"),
         ("\n_PAIR = (-4, 2.0)", "\n_PAIR = (-6, 3.0)"),
+        ("\n_GRID = ((1, 2), (3, 4))", "\n_GRID = ((2, 3), (4, 6))"),
         ("\n    share: float = 0.25", "\n    share: float = 0.375"),
     ]
     assert {m.tests for m in found} == {("tests/test_part.py",)}
-    assert "_PAIR = (-6, 3.0)\n_ZERO" in mutated(found[2], text)
+    assert "_PAIR = (-6, 3.0)\n_GRID" in mutated(found[2], text)
 
 
 def test_constants_of_this_checkout_can_be_changed() -> None:
