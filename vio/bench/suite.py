@@ -141,9 +141,6 @@ def suite_from(values: Any, path: Path) -> Suite:
         raise ConfigError(f"{where}: no sequences; name at least one")
     titles = _mapping(given.get("titles") or {}, where, "'titles'")
     publisher = given.get("publisher")
-    limit = given.get("time_limit_s")
-    if limit is not None:
-        limit = _positive(limit, "time_limit_s", where)
     published = given.get("published") or ()
     suite = Suite(
         name=str(given.get("name", path.stem)),
@@ -157,7 +154,7 @@ def suite_from(values: Any, path: Path) -> Suite:
         success_percent=_positive(
             given.get("success_percent", SUCCESS_PERCENT), "success_percent", where
         ),
-        time_limit_s=limit,
+        time_limit_s=_time_limit(given.get("time_limit_s"), where),
     )
     _check_combinations(suite, where)
     return suite
@@ -166,6 +163,10 @@ def suite_from(values: Any, path: Path) -> Suite:
 def _sequences(given: Mapping[Any, Any], where: str) -> Iterator[Sequence]:
     for name, value in given.items():
         yield _sequence(str(name), value, where)
+
+
+def _time_limit(value: Any, where: str) -> float | None:
+    return None if value is None else _positive(value, "time_limit_s", where)
 
 
 def _texts(given: Mapping[Any, Any]) -> dict[str, str]:
