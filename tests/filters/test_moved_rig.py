@@ -17,9 +17,10 @@ COURSE = Course(20, 2.5, velocity=(0.4, 0.5, 0.0), yaw_rate=0.2, depth=(2.0, 8.0
 ON = replace(SETTINGS, calibrate_stereo="on")
 MOVED_AT = 30  # frame, of 50
 COLUMNS_PX = 2.0
-ROWS_PX = 0.5
+ROWS_PX = 0.3  # after it; before, as much the other way, so that their size stays
 
 
+BEFORE_PX = np.array([0.0, 0.0, 0.0, -ROWS_PX])
 OFF_PX = np.array([0.0, 0.0, COLUMNS_PX, ROWS_PX])
 
 
@@ -28,7 +29,7 @@ def _off(k: int, seen: Observations) -> Observations:
 
 
 def _moved(k: int, seen: Observations) -> Observations:
-    return _off(k, seen) if k >= MOVED_AT else seen
+    return replace(seen, z=seen.z + (OFF_PX if k >= MOVED_AT else BEFORE_PX))
 
 
 @pytest.fixture
