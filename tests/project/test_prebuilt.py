@@ -12,7 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -258,6 +258,17 @@ def test_a_loop_that_was_edited_is_compiled_anew(
     loop, out = _fresh("add_halves"), np.zeros(3)
     # as a constant of a function that it calls is another
     assert not _is_loaded(loop, np.arange(3.0), out)
+
+
+def test_a_record_that_a_loop_makes_belongs_to_it() -> None:
+    def made_with(fields: list[tuple[str, type]]) -> str:
+        scope = {"Pair": NamedTuple("Pair", fields), "np": np}
+        exec("def loop(x):\n    return Pair(x, x)", scope)
+        return prebuilt.fingerprint(scope["loop"], {})  # type: ignore[arg-type]
+
+    one = made_with([("a", float), ("b", float)])
+    assert one == made_with([("a", float), ("b", float)])
+    assert one != made_with([("b", float), ("a", float)])
 
 
 def test_options_belong_to_a_loop(folder: Path) -> None:

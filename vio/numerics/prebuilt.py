@@ -96,6 +96,8 @@ def _text(value: Any) -> str:
         return repr(value)
     if value is np:
         return "numpy"
+    if isinstance(value, type) and issubclass(value, tuple):  # a NamedTuple that is made inside
+        return f"{value.__name__}{value._fields}{value._field_defaults}"  # type: ignore[attr-defined]
     return str(value.fingerprint)  # of a compiled function
 
 
