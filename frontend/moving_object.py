@@ -22,7 +22,7 @@ Nothing tells which: it is used, and reported at once.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -51,17 +51,43 @@ Decision: TypeAlias = Literal["predicted", "voted", "undecided", "unsupported"]
 # ratio of two motions' squared distances from a measured one, above which the nearer agrees
 CLEARLY_NEARER = 10.0
 MIN_POINTS = 12  # of a second motion
-_MIN_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
-_LARGE_SHARE = 0.25  # share of all points above which a second motion is reported
-# of the smaller group's points that no depth within the disparities' error explains: an object
-_SEEN_SHARE = 0.5
-_MIN_STATIC = 0.8  # share of a consensus without depths that a measured motion must explain
-_FAR_M = 1e4  # depth of what is infinitely far away
-# errors of points of the scene over the median of those that are static for long: of 1000 one more
-_FOLLOWING = 3.2
-_VOTERS = 50  # how many points vote, and for how many frames each must have been static
-_VOTING_FRAMES = 5
-_CLEAR_VOTE = 0.7  # share of the voting points that must follow a motion
+
+
+class _SecondMotion(NamedTuple):
+    """When a second motion counts."""
+
+    # points of a second motion that may replace the first, over the first's
+    min_support_share: float = 0.1
+    large_share: float = 0.25  # share of all points above which a second motion is reported
+    # of the smaller group's points that no depth within the disparities' error explains: an object
+    seen_share: float = 0.5
+
+
+_SECOND = _SecondMotion()
+
+
+class _AgreementRules(NamedTuple):
+    """When a motion agrees with a measured one."""
+
+    # share of a consensus without depths that a measured motion must explain
+    min_static_share: float = 0.8
+    far_m: float = 1e4  # depth of what is infinitely far away
+
+
+_AGREEMENT = _AgreementRules()
+
+
+class _VoteRules(NamedTuple):
+    """How points that were static for long vote."""
+
+    # errors of points of the scene over the median of those that are static for long: of 1000 one more
+    following_ratio: float = 3.2
+    voters: int = 50  # how many points vote, and for how many frames each must have been static
+    static_frames: int = 5
+    clear_share: float = 0.7  # share of the voting points that must follow a motion
+
+
+_VOTE = _VoteRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +175,7 @@ class _Case:
     @property
     def min_support(self) -> float:
         """Points that a second motion needs."""
-        return float(max(MIN_POINTS, _MIN_SUPPORT * self.found.inliers.sum()))
+        return float(max(MIN_POINTS, _SECOND.min_support_share * self.found.inliers.sum()))
 
     def followers(self, T: FloatArray) -> BoolArray:
         """Mask (N,) of the points whose pixels a motion (4, 4) explains."""
@@ -302,7 +328,7 @@ def _prediction_overrules(
 
 def _if_large(share: float) -> float:
     """The share of an object that is reported; 0 for a small one."""
-    return float(share) if share >= _LARGE_SHARE else 0.0
+    return float(share) if share >= _SECOND.large_share else 0.0
 
 
 def _followers(
@@ -333,7 +359,7 @@ def _near_prediction(
     inliers = _followers(problem, T, p_prev, pixels)
     alone = inliers & ~found.inliers
     others = found.inliers & ~inliers
-    if alone.sum() < max(MIN_POINTS, _MIN_SUPPORT * others.sum()):
+    if alone.sum() < max(MIN_POINTS, _SECOND.min_support_share * others.sum()):
         return None
     return (
         Consensus(T, inliers) if expected.distance(T, p_prev[inliers]) <= AGREEMENT_LIMIT else None
@@ -359,13 +385,13 @@ def _without_slow_object(
         return None
     T, _ = best_motion(problem, p_prev[old], pixels[old], expected.prior.T_curr_prev[None])
     errors = pixel_errors(problem.camera, T, p_prev, pixels)
-    usual_px = _FOLLOWING * float(np.median(errors[old]))
+    usual_px = _VOTE.following_ratio * float(np.median(errors[old]))
     follows = np.asarray(errors <= min(usual_px, problem.limit_px))
     moving = found.inliers & ~follows
     # old points that do not follow: the scene is no better known than what came into view
-    if moving.sum() < max(MIN_POINTS, _LARGE_SHARE * len(p_prev)):
+    if moving.sum() < max(MIN_POINTS, _SECOND.large_share * len(p_prev)):
         return None
-    if (moving & voting).sum() > (1.0 - _CLEAR_VOTE) * voting.sum():
+    if (moving & voting).sum() > (1.0 - _VOTE.clear_share) * voting.sum():
         return None
     return Consensus(T, follows) if expected.distance(T, p_prev[old]) <= AGREEMENT_LIMIT else None
 
@@ -378,14 +404,14 @@ def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] 
     """
     for_first = int((first & ~second).sum())
     for_second = int((second & ~first).sum())
-    if max(for_first, for_second) < max(MIN_POINTS, _CLEAR_VOTE * (for_first + for_second)):
+    if max(for_first, for_second) < max(MIN_POINTS, _VOTE.clear_share * (for_first + for_second)):
         return None
     return "first" if for_first > for_second else "second"
 
 
 def _votes_for(found: Consensus, voting: BoolArray) -> bool:
     """Whether most of the voting points (N,) follow a motion."""
-    return bool(voting.sum() >= MIN_POINTS and found.inliers[voting].mean() >= _CLEAR_VOTE)
+    return bool(voting.sum() >= MIN_POINTS and found.inliers[voting].mean() >= _VOTE.clear_share)
 
 
 def _voted(
@@ -402,7 +428,7 @@ def _voted(
         return None
     starts = np.stack([found.T_curr_prev, np.eye(4)])
     T, follows = best_motion(problem, p_prev[voting], pixels[voting], starts)
-    if follows.mean() < _CLEAR_VOTE:
+    if follows.mean() < _VOTE.clear_share:
         return None
     inliers = _followers(problem, T, p_prev, pixels)
     # the oldest points may all be far away
@@ -433,7 +459,7 @@ def static_by_prediction(
         near_m: the smallest depth.
     """
     static = _agree_with(problem.camera, predicted, before, after, near_m, problem.limit_px)
-    if static.sum() < MIN_POINTS or share_of(static[kept]) >= _MIN_STATIC:
+    if static.sum() < MIN_POINTS or share_of(static[kept]) >= _AGREEMENT.min_static_share:
         return kept
     return static
 
@@ -466,7 +492,7 @@ def _agree_with(
     across = np.cross(seen, T[:3, 3])
     off = np.cross(seen, turned)
     inverse = -np.sum(across * off, axis=1) / (np.sum(across * across, axis=1) + 1e-12)
-    p = turned / np.clip(inverse, 1.0 / _FAR_M, 1.0 / near_m)[:, None] + T[:3, 3]
+    p = turned / np.clip(inverse, 1.0 / _AGREEMENT.far_m, 1.0 / near_m)[:, None] + T[:3, 3]
     ahead = depth_of(camera, p) > 0.0
     p[~ahead] = [0.0, 0.0, 1.0]
     J = pixel_D_motion(camera, p)
@@ -503,7 +529,7 @@ def one_motion_explains(
     off = ~static | ~_within_depths(problem, motion.T_curr_prev, p_prev, pixels, disparity_error_px)
     # of the groups: the larger one is fitted
     smaller = min(chosen.object_share, share_of(motion.inliers))
-    return float(off.mean()) < _SEEN_SHARE * smaller
+    return float(off.mean()) < _SECOND.seen_share * smaller
 
 
 def _within_depths(
@@ -525,7 +551,7 @@ def _within_depths(
     span = 2.0 * disparity_error_px * (1.0 + aside * aside)
     ends = []
     for off in (-span, span):
-        changed = np.maximum(disparity + off, constant / _FAR_M)
+        changed = np.maximum(disparity + off, constant / _AGREEMENT.far_m)
         p = transform_points(T, p_prev * (disparity / changed)[:, None])
         ahead = depth_of(camera, p) > 0.0
         p[~ahead] = [0.0, 0.0, 1.0]
@@ -545,5 +571,9 @@ def voters(age: IntArray) -> BoolArray:
     What has come into view, and moves slowly enough to pass for static, is younger than what was
     there before.
     """
-    oldest = np.partition(age, len(age) - _VOTERS)[len(age) - _VOTERS] if len(age) > _VOTERS else 0
-    return np.asarray(age >= max(oldest, _VOTING_FRAMES))
+    oldest = (
+        np.partition(age, len(age) - _VOTE.voters)[len(age) - _VOTE.voters]
+        if len(age) > _VOTE.voters
+        else 0
+    )
+    return np.asarray(age >= max(oldest, _VOTE.static_frames))

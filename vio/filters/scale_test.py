@@ -11,6 +11,8 @@ Reference: Friedland, Treatment of bias in recursive filtering, IEEE TAC (1969).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.filters import pose_loops as loops
@@ -18,31 +20,39 @@ from vio.filters.navigation import NavState
 from vio.geometry.lie import FloatArray
 from vio.numerics.statistics import squared_distance
 
-_SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
-# More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
-_MIN = 0.04
-_SIGMAS = 5.0
-# The accelerometer's noise is in the motion that is held against the images, and there passes for
-# motion at twice the scale. It has three degrees of freedom in a frame, of which images determine a
-# part: 0.1 of information on a recording of standstill, with more where the real noise is that of
-# the settings. One is allowed for.
-_BY_NOISE = 1.0
+
+class _ScaleRules(NamedTuple):
+    """When a motion sensor contradicts the scale."""
+
+    # of the logarithm; a unit that is wrong is off by more, and is found as well
+    log_sigma: float = 0.1
+    # More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
+    min_log: float = 0.04
+    min_sigmas: float = 5.0
+    # The accelerometer's noise is in the motion that is held against the images, and there passes for
+    # motion at twice the scale. It has three degrees of freedom in a frame, of which images determine a
+    # part: 0.1 of information on a recording of standstill, with more where the real noise is that of
+    # the settings. One is allowed for.
+    information_by_noise: float = 1.0
+    # A velocity's squared standard deviations beyond which its own error makes less than 3 % of what it
+    # says of the scale.
+    clear_squared_sigmas: float = 100.0
+
+
+_SCALE = _ScaleRules()
 # Of rigs whose scale is as calibrated, what the test finds has this standard deviation beside its
 # own: half of the least that it reports.
-_USUAL_SIGMA = 0.5 * _MIN
+_USUAL_SIGMA = 0.5 * _SCALE.min_log
 # Weight of a wrong calibration before anything was measured. What it adds is small where the sensor
 # agrees, whatever the weight.
 _WRONG_SHARE = 0.25
-# A velocity's squared standard deviations beyond which its own error makes less than 3 % of what it
-# says of the scale.
-_CLEAR = 100.0
 
 
 def is_clear(velocity: FloatArray, covariance: FloatArray) -> bool:
     """Whether a velocity (3,) of a covariance (3, 3) is far enough from its noise to tell the
     scale.
     """
-    return squared_distance(velocity, covariance, 1e-18) > _CLEAR
+    return squared_distance(velocity, covariance, 1e-18) > _SCALE.clear_squared_sigmas
 
 
 def scaled_nav(nav: NavState, T_cam0_imu: FloatArray) -> FloatArray:
@@ -67,7 +77,7 @@ class ScaleTest:
         self._frames = 0  # since the start
         # at which of them the scale was contradicted without a break since; 0: it is not
         self._doubted = 0
-        self._information = _SIGMA**-2
+        self._information = _SCALE.log_sigma**-2
         self._vector = 0.0
         # whether as many frames again have contradicted it as it took to find
         self.is_confirmed = False
@@ -95,7 +105,7 @@ class ScaleTest:
         stepped by an hour, rounding may leave less than the start had, and they are passed over.
         """
         information = self._information + float(V @ W - W @ P @ W)
-        if not information >= _SIGMA**-2:
+        if not information >= _SCALE.log_sigma**-2:
             return
         self._information = information
         self._vector += float(V @ remaining)
@@ -111,11 +121,11 @@ class ScaleTest:
         distributions, whose weights follow from what was measured by Bayes' rule. Without a
         measurement it is zero: then the calibration counts.
         """
-        measured = self._information - _SIGMA**-2
+        measured = self._information - _SCALE.log_sigma**-2
         if measured <= 0.0:
             return 0.0
         log = self._vector / measured
-        variances = np.array([_USUAL_SIGMA, _SIGMA]) ** 2 + 1.0 / measured
+        variances = np.array([_USUAL_SIGMA, _SCALE.log_sigma]) ** 2 + 1.0 / measured
         squared = log**2 / variances
         likelihood = np.exp(-0.5 * (squared - squared[1]))  # over that of a wrong calibration
         weights = likelihood / np.sqrt(variances) * [1.0 - _WRONG_SHARE, _WRONG_SHARE]
@@ -128,4 +138,7 @@ class ScaleTest:
         noise explains.
         """
         s, sigma = self.estimate()
-        return abs(s) > max(_MIN + _BY_NOISE * self._frames / self._information, _SIGMAS * sigma)
+        return abs(s) > max(
+            _SCALE.min_log + _SCALE.information_by_noise * self._frames / self._information,
+            _SCALE.min_sigmas * sigma,
+        )

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from vio.dataclass import dataclass
 from vio.live.frame_pipeline import FramePipeline
@@ -19,7 +19,17 @@ if TYPE_CHECKING:
 
 # a frame waits until one that is so much newer has come: then the IMU is silent
 LONGEST_WAIT_NS = 100_000_000
-_MAX_SAMPLES = 100_000  # that wait: minutes in which no frame came
+
+
+class _WaitRules(NamedTuple):
+    """How long a frame waits for samples."""
+
+    max_samples: int = 100_000  # that wait: minutes in which no frame came
+    min_s: float = 1e-3  # a velocity carries the pose that far as well as the IMU does
+    clear_sigmas: float = 3.0  # standard deviations of a time offset that is waited for
+
+
+_WAIT = _WaitRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +78,7 @@ class EventOrder:
         """Take one or more samples at once, as `add` does one after the other."""
         self._samples += samples
         self._newest_ns = samples[-1].time_ns
-        del self._samples[:-_MAX_SAMPLES]
+        del self._samples[: -_WAIT.max_samples]
         return self._due()
 
     def flush(self) -> Iterator[Due]:
@@ -111,17 +121,17 @@ class EventOrder:
         return Due(samples, frame)
 
 
-_MIN_WAIT_S = 1e-3  # a velocity carries the pose that far as well as the IMU does
-_CLEAR = 3.0  # standard deviations of a time offset that is waited for
-
-
 def _wait_ns(estimate: Estimate) -> int:
     """How long after its stamp a frame is processed, ns, so that the IMU's samples reach its
     exposure.
     """
     offset_s = estimate.time_offset_s
     sigma_s = estimate.time_offset_sigma_s
-    if offset_s is None or sigma_s is None or offset_s < max(_MIN_WAIT_S, _CLEAR * sigma_s):
+    if (
+        offset_s is None
+        or sigma_s is None
+        or offset_s < max(_WAIT.min_s, _WAIT.clear_sigmas * sigma_s)
+    ):
         return 0
     return round(1e9 * offset_s)
 

@@ -10,7 +10,7 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,12 +29,20 @@ from vio.ros2.transport import Quality, Transport
 log = logging.getLogger(__name__)
 
 SILENT_S = 5.0  # without a message, before it is said
-# a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
-_BACK_NS = 500_000_000
+
+
+class _StampRules(NamedTuple):
+    """When stamps begin anew."""
+
+    # a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
+    back_ns: int = 500_000_000
+    passed_share: float = 0.1
+
+
+_STAMPS = _StampRules()
 # A stamp so far ahead of the last one begins anew, too, where less than a tenth of that time has
 # passed: the clock was set. A gap in a bag that is played ten times as fast is none.
 _AHEAD_NS = 5 * NS_PER_S
-_PASSED = 0.1
 _LEVEL_IMAGES = 8  # of 16 bits, looked at for the levels of black and white
 _MAX_REASONS = 50  # that are named
 
@@ -71,12 +79,14 @@ class _Step:
     @property
     def is_back(self) -> bool:
         """Whether the stamp lies far before the last one."""
-        return self.stamped_ns < -_BACK_NS
+        return self.stamped_ns < -_STAMPS.back_ns
 
     @property
     def is_ahead(self) -> bool:
         """Whether it lies far after the last one, by far more than the time that has passed."""
-        return self.stamped_ns > _AHEAD_NS and self.arrived_ns < _PASSED * self.stamped_ns
+        return (
+            self.stamped_ns > _AHEAD_NS and self.arrived_ns < _STAMPS.passed_share * self.stamped_ns
+        )
 
     @property
     def is_usual(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,12 +26,19 @@ from vio.targets.start import one_camera, pair_start, pose_only
 from vio.targets.verdict import MIN_VIEWS, Verdict, corners_by_part, judge, part_name
 from vio.targets.views import Sightings, sightings
 
-_MIN_CORNERS = 12  # of a view that is used
-_MAX_VIEWS = 60
-_DOUBT_SIGMAS = 2.0  # stated, beyond which another lens model's difference is named
-_MIN_DOUBT_PX = 0.1
-_MAX_REFUSED = 0.3  # of a pair's corners, beyond which it is none
-_MAX_RESIDUAL_PX = 3.0  # beyond which the board or the lens is another one
+
+class _ViewRules(NamedTuple):
+    """Which views are used, and what of them is doubted."""
+
+    min_corners: int = 12  # of a view that is used
+    max_views: int = 60
+    doubt_sigmas: float = 2.0  # stated, beyond which another lens model's difference is named
+    min_doubt_px: float = 0.1
+    max_refused_share: float = 0.3  # of a pair's corners, beyond which it is none
+    max_residual_px: float = 3.0  # beyond which the board or the lens is another one
+
+
+_VIEWS = _ViewRules()
 _SAME_PLACE_PX = 2.0  # between the corners of two images, below which they show one view
 _DOUBTFUL_PX = 0.5  # residual beyond which the images are asked whether the board is the file's
 _MAX_TURN_DEG = 90.0  # of a pair's cameras against each other, which no rectification holds
@@ -108,7 +116,7 @@ def lens_finding(lens: str, rivals: tuple[Rival, ...], verdict: Verdict) -> str 
     stated = verdict.inflation * verdict.projection_sigma_px[0]
     beyond: list[tuple[float, str, str]] = []
     for rival in rivals:
-        limit = np.maximum(_DOUBT_SIGMAS * stated, _MIN_DOUBT_PX)
+        limit = np.maximum(_VIEWS.doubt_sigmas * stated, _VIEWS.min_doubt_px)
         off = np.where(rival.off_px > limit, rival.off_px, 0.0)
         worst = int(np.argmax(off))
         if off[worst] > 0:
@@ -146,12 +154,12 @@ def calibrate_with_imu(
         raise DataError("the recording has no IMU; record its samples with the images")
     seen = sightings(filmed.views, target.points_m)
     left = np.bincount(seen.view[seen.camera == 0], minlength=seen.views)
-    chosen = np.flatnonzero(left >= _MIN_CORNERS)
+    chosen = np.flatnonzero(left >= _VIEWS.min_corners)
     seen = seen.of_views(chosen)
     problem, found = pose_only(cameras.found.at, seen)
     # A view that fits badly has a wrong pose.
     used = np.bincount(seen.view[found.used & (seen.camera == 0)], minlength=seen.views)
-    good = np.flatnonzero(used >= _MIN_CORNERS)
+    good = np.flatnonzero(used >= _VIEWS.min_corners)
     times_ns = np.array([filmed.views[v].time_ns for v in chosen[good].tolist()], dtype=np.int64)
     information, xi_D_lens = problem.pose_information(found)
     variance = cameras.verdict.inflation**2
@@ -171,11 +179,11 @@ def chosen_views(seen: Sightings) -> Sightings:
     """
     image = seen.view * seen.cameras + seen.camera
     counts = np.bincount(image, minlength=seen.views * seen.cameras)
-    kept = seen.take(np.flatnonzero(counts[image] >= _MIN_CORNERS))
+    kept = seen.take(np.flatnonzero(counts[image] >= _VIEWS.min_corners))
     views: IntArray = np.unique(kept.view)
-    if len(views) > _MAX_VIEWS:
+    if len(views) > _VIEWS.max_views:
         total = np.bincount(kept.view, minlength=seen.views)
-        parts = np.array_split(views, _MAX_VIEWS)
+        parts = np.array_split(views, _VIEWS.max_views)
         views = np.array([part[np.argmax(total[part])] for part in parts], dtype=np.int64)
     return kept.of_views(views)
 
@@ -198,7 +206,7 @@ def _explained(filmed: Filmed, camera: int, target: Target) -> Iterator[None]:
 def _check_views(filmed: Filmed, target: Target) -> None:
     names = ("left", "right") if len(filmed.sizes) > 1 else ("only",)
     for c, name in enumerate(names):
-        count = sum(len(view.corners[c]) >= _MIN_CORNERS for view in filmed.views)
+        count = sum(len(view.corners[c]) >= _VIEWS.min_corners for view in filmed.views)
         if count < MIN_VIEWS:
             if (reason := _diagnosis(filmed, c, target)) is not None:
                 raise DataError(f"{name} camera: {reason}")
@@ -222,7 +230,7 @@ def _check_views(filmed: Filmed, target: Target) -> None:
         images = [images[c] for images in filmed.samples]
         if (other := clearly_other_board(images, target)) is not None:
             raise DataError(f"{name} camera: {other}")
-    together = sum(min(map(len, view.corners)) >= _MIN_CORNERS for view in filmed.views)
+    together = sum(min(map(len, view.corners)) >= _VIEWS.min_corners for view in filmed.views)
     if together < MIN_VIEWS // 2:
         raise DataError(
             f"the cameras see the board together in {together} frames, and {MIN_VIEWS // 2} are "
@@ -238,7 +246,7 @@ def _places(filmed: Filmed, camera: int) -> int:
     known: list[Corners] = []
     for view in filmed.views:
         corners = view.corners[camera]
-        if len(corners) < _MIN_CORNERS:
+        if len(corners) < _VIEWS.min_corners:
             continue
         if all(_apart_px(corners, other) > _SAME_PLACE_PX for other in known):
             known.append(corners)
@@ -260,7 +268,7 @@ def _check_fit(one: Adjusted, camera: int, filmed: Filmed, target: Target) -> No
     if residual < _DOUBTFUL_PX:
         return
     reason = _diagnosis(filmed, camera, target)
-    if reason is not None or residual > _MAX_RESIDUAL_PX:
+    if reason is not None or residual > _VIEWS.max_residual_px:
         advice = reason or "check rows, columns, tag spacing and numbering in the target file"
         raise CalibrationError(
             f"camera {camera}: corners are off by {residual:.1f} px (median) with the best lens; "
@@ -272,7 +280,7 @@ def _check_pair(found: Adjusted) -> None:
     """Refuse images that are no pair, or exchanged."""
     refused = float(np.mean(~found.used))
     off_px = float(found.sigma_px.max())
-    if refused > _MAX_REFUSED or off_px > _MAX_RESIDUAL_PX:
+    if refused > _VIEWS.max_refused_share or off_px > _VIEWS.max_residual_px:
         raise DataError(
             "left and right images are not of the same moments: corners fit each camera alone, and "
             f"with one pose of the right camera they are off by {off_px:.0f} px, "
