@@ -25,9 +25,20 @@ from vio.records import BoolArray, Image, IntArray
 
 _PARAMETERS = 8  # shift u, v; gain; offset; linear part in row-major order
 _ROW_PARAMETERS = 6  # the same without the second row of the linear part
-_ROW_SIGMA_PX = 0.3  # standard deviation of a feature's row in the other image of a rectified pair
-_GRAY_SIGMA = 4.0  # standard deviation between the two images of one patch, after gain and offset
-_ROW_WEIGHT = (_GRAY_SIGMA / _ROW_SIGMA_PX) ** 2
+
+
+class _FitSigmas(NamedTuple):
+    """Standard deviations that the alignment takes for given."""
+
+    # standard deviation of a feature's row in the other image of a rectified pair
+    row_px: float = 0.3
+    # standard deviation between the two images of one patch, after gain and offset
+    gray: float = 4.0
+    window_share: float = 0.4  # standard deviation of the window over the radius of a template
+
+
+_SIGMAS = _FitSigmas()
+_ROW_WEIGHT = (_SIGMAS.gray / _SIGMAS.row_px) ** 2
 MAX_MOVE_PX = 2.5  # of a fitted pixel from its start; beyond, it has left the correlation peak
 # step at which a template has converged; the remaining error is a small fraction of it
 _DONE_PX = 0.05
@@ -36,9 +47,8 @@ _MAX_SCORE = 0.99999
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
 _DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured directions
-_WINDOW_SIGMA = 0.4  # standard deviation of the window over the radius of a template
 # of the radius, up to which a template must be inside the image: most of its weight
-INSIDE = 2.0 * _WINDOW_SIGMA
+INSIDE = 2.0 * _SIGMAS.window_share
 # anchors are cut at multiples of this fraction of a pixel, where the weights of float32 are exact
 _SUBPIXELS = 32
 FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
@@ -107,7 +117,9 @@ def window(radius: int) -> Pixels:
     they are worth.
     """
     weight = np.exp(
-        -0.5 * (disc(radius).astype(np.float64) ** 2).sum(axis=0) / (_WINDOW_SIGMA * radius) ** 2
+        -0.5
+        * (disc(radius).astype(np.float64) ** 2).sum(axis=0)
+        / (_SIGMAS.window_share * radius) ** 2
     )
     out = (weight * weight.sum() / (weight @ weight)).astype(np.float32)
     out.flags.writeable = False

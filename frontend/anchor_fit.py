@@ -20,10 +20,17 @@ from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, IntArray
 
-_ITERATIONS = 5
-_MIN_CORRELATION = 0.8  # normalised, with the anchor; below, the anchor is replaced
-_ANCHOR_LOST = 0.5  # below, the feature is lost
-_MAX_SCALE = 1.25  # change of scale at which the anchor is replaced
+
+class _AnchorRules(NamedTuple):
+    """When an anchor is replaced."""
+
+    iterations: int = 5
+    min_correlation: float = 0.8  # normalised, with the anchor; below, the anchor is replaced
+    lost_correlation: float = 0.5  # below, the feature is lost
+    max_scale: float = 1.25  # change of scale at which the anchor is replaced
+
+
+_ANCHORS = _AnchorRules()
 _MIN_DEPTH_M = 0.1  # after the motion, of a point whose pixel and scale are predicted
 _NEAREST_M = 0.05  # of a point that has a pixel to compare with
 
@@ -83,15 +90,17 @@ class AnchorFit:
         slots = old.slot.take(rows)
         warp[:, :, :2] *= scale[:, None, None]
         warp[:, :, 2] = start
-        warp, score = align(self._bank.store, slots, left.full, warp, _ITERATIONS)
+        warp, score = align(self._bank.store, slots, left.full, warp, _ANCHORS.iterations)
         change = scale_change(warp)
         change = np.maximum(change, 1.0 / change)
         good = (
-            (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start) & (change <= 2 * _MAX_SCALE)
+            (score >= _ANCHORS.min_correlation)
+            & on_peak(warp[:, :, 2], start)
+            & (change <= 2 * _ANCHORS.max_scale)
         )
         kept = good.copy()
         has_point = old.has_point.copy()
-        retry = (~good & seen[rows] & (score >= _ANCHOR_LOST)).nonzero()[0]
+        retry = (~good & seen[rows] & (score >= _ANCHORS.lost_correlation)).nonzero()[0]
         if len(retry):
             again = old.left.take(rows[retry], axis=0), slots[retry], start[retry], scale[retry]
             warp[retry], kept[retry] = self._realign(before, left, *again)
@@ -104,7 +113,7 @@ class AnchorFit:
         rows = rows[chosen]
         slots = slots[chosen]
         warp = warp.take(chosen, axis=0)
-        rescaled = (good & (change > _MAX_SCALE))[chosen]
+        rescaled = (good & (change > _ANCHORS.max_scale))[chosen]
         if rescaled.any():
             centres = rounded(warp[rescaled, :, 2])
             self._bank.replace(slots[rescaled], left.full, centres)
@@ -148,10 +157,10 @@ class AnchorFit:
         self._bank.replace(slots, before.full, centres)
         warp = shift_warps(start + centres - pixels)
         warp[:, :, :2] *= scale[:, None, None]
-        warp, score = align(self._bank.store, slots, left.full, warp, _ITERATIONS)
+        warp, score = align(self._bank.store, slots, left.full, warp, _ANCHORS.iterations)
         # The anchor was cut at a rounded pixel; correct the offset to the feature.
         warp[:, :, 2] = template_points(warp, pixels - centres)
-        return warp, (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start)
+        return warp, (score >= _ANCHORS.min_correlation) & on_peak(warp[:, :, 2], start)
 
 
 class _Moved(NamedTuple):

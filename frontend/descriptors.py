@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import cv2
 import numpy as np
@@ -46,16 +46,33 @@ from vio.records import (
 Vectors: TypeAlias = npt.NDArray[np.float32]
 Descriptors: TypeAlias = Vectors | npt.NDArray[np.uint8]
 
-_MAX_RATIO = 0.8  # of a descriptor's distance to that of the second-nearest
-# half side of the search window around the predicted pixel, over the image width
-_SEARCH_RADIUS = 0.06
+
+class _MatchRules(NamedTuple):
+    """Which key points match."""
+
+    max_ratio: float = 0.8  # of a descriptor's distance to that of the second-nearest
+    # half side of the search window around the predicted pixel, over the image width
+    search_share: float = 0.06
+    # largest reprojection error of a static feature under the consensus motion
+    inlier_px: float = 1.5
+    far_m: float = 1e6  # depth assumed where it is unknown
+    min_depth_m: float = 0.05
+    # key points closer to the image border are dropped: their patch would not fit
+    border_px: float = 8.0
+
+
+_MATCHES = _MatchRules()
 _MAX_ROW_DIFFERENCE_PX = 1.5  # of a stereo match
-_INLIER_PX = 1.5  # largest reprojection error of a static feature under the consensus motion
-_REFINE_ITERATIONS = 6
-_REFINE_MIN_CORRELATION = 0.8
-_FAR_M = 1e6  # depth assumed where it is unknown
-_MIN_DEPTH_M = 0.05
-_BORDER_PX = 8.0  # key points closer to the image border are dropped: their patch would not fit
+
+
+class _RefineRules(NamedTuple):
+    """How matches are refined."""
+
+    iterations: int = 6
+    min_correlation: float = 0.8
+
+
+_REFINE = _RefineRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +110,7 @@ class MutualNearest:
     7.1.
     """
 
-    ratio: float = _MAX_RATIO  # largest distance over that of the second-nearest
+    ratio: float = _MATCHES.max_ratio  # largest distance over that of the second-nearest
 
     def __call__(self, a: Keypoints, b: Keypoints, allowed: BoolArray) -> IntArray:
         """Return pairs (K, 2); see `Matcher`."""
@@ -298,7 +315,7 @@ class DescriptorFrontend:
         usable = not isinstance(frame, CheckedFrame) or frame.right_usable
         shown = images if usable else images[:1]
         extracted = [
-            take(points, inside(images[0], points.pixels, _BORDER_PX))
+            take(points, inside(images[0], points.pixels, _MATCHES.border_px))
             for points in self._extract(*shown)
         ]
         watch.lap("extract")
@@ -361,10 +378,10 @@ class DescriptorFrontend:
         store = templates(cut_patches(source, centres, ANCHOR_RADIUS_PX))
         slots = np.arange(len(points))
         warp, score = align(
-            store, slots, target, shift_warps(start - offset), _REFINE_ITERATIONS, rows
+            store, slots, target, shift_warps(start - offset), _REFINE.iterations, rows
         )
         pixels = template_points(warp, offset)
-        good = (score >= _REFINE_MIN_CORRELATION) & on_peak(pixels, start)
+        good = (score >= _REFINE.min_correlation) & on_peak(pixels, start)
         return np.where(good[:, None], pixels, start), good
 
     # --- tracking in time
@@ -394,7 +411,7 @@ class DescriptorFrontend:
         expected = se3_exp(previous.twist_per_s * seconds)
         p_prev, has_depth = triangulate(self._camera, np.concatenate([old.left, old.right], axis=1))
         has_depth &= old.has_right
-        far = left_rays(self._camera, old.left) * _FAR_M
+        far = left_rays(self._camera, old.left) * _MATCHES.far_m
         guess = self._guess(old, np.where(has_depth[:, None], p_prev, far), expected, prior)
         pairs = self._match(
             old.keypoints, pair.keypoints, self._near_guess(old, guess, left, view.shape[1])
@@ -413,7 +430,7 @@ class DescriptorFrontend:
                 predicted_motion(self._camera, p_prev[has_depth][named], predicted, expected),
             )
         rng = np.random.default_rng((self._seed, frame.index))
-        problem = RansacProblem(self._camera, _INLIER_PX, rng)
+        problem = RansacProblem(self._camera, _MATCHES.inlier_px, rng)
         known = has_depth[rows]
         p_rows = p_prev[rows]
         keep, motion = static_tracks(
@@ -429,11 +446,11 @@ class DescriptorFrontend:
             keep[~known] = False
             twist = se3_log(motion.T_curr_prev) / seconds
             depth = depth_of(self._camera, transform_points(motion.T_curr_prev, p_rows))
-            depth = np.maximum(depth, _MIN_DEPTH_M)
+            depth = np.maximum(depth, _MATCHES.min_depth_m)
             change = np.abs(
                 pixels[:, 0] - right[:, 0] - self._camera.fu * self._camera.baseline_m / depth
             )
-            agrees = agrees & (~known | (change <= _INLIER_PX))
+            agrees = agrees & (~known | (change <= _MATCHES.inlier_px))
         rows = rows[keep]
         found = found[keep]
         used[found] = True
@@ -465,7 +482,9 @@ class DescriptorFrontend:
         """
         near = np.empty((len(old), len(points)), dtype=np.bool_)
         # The last motion may be wrong, so the old pixel is a second centre of the search.
-        _near_either(guess, old.left, np.ascontiguousarray(points.T), _SEARCH_RADIUS * width, near)
+        _near_either(
+            guess, old.left, np.ascontiguousarray(points.T), _MATCHES.search_share * width, near
+        )
         return near
 
     def _add_new_features(

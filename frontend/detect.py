@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,13 +22,21 @@ from vio.records import BoolArray, Image, IntArray
 
 Response = npt.NDArray[np.float32]
 
-_CELL_FEATURES = 4  # target number of features per grid cell; determines the cell size
-_MIN_DISTANCE = 0.15  # between features, over the spacing of a uniform grid of them
-# of a corner in its weakest direction, gray levels per pixel: root mean square over 6x6 pixels
-_MIN_GRADIENT = 1.0
-_MIN_RELATIVE_GRADIENT = 0.15  # the same, over that of the strongest corner of its grid cell
-# where corners are few: down to so many times the gradient of the image noise
-_MIN_GRADIENT_OVER_NOISE = 5.0
+
+class _CornerRules(NamedTuple):
+    """Which corners are taken."""
+
+    cell_features: int = 4  # target number of features per grid cell; determines the cell size
+    min_distance_share: float = 0.15  # between features, over the spacing of a uniform grid of them
+    # of a corner in its weakest direction, gray levels per pixel: root mean square over 6x6 pixels
+    min_gradient: float = 1.0
+    # the same, over that of the strongest corner of its grid cell
+    min_relative_gradient: float = 0.15
+    # where corners are few: down to so many times the gradient of the image noise
+    min_gradient_over_noise: float = 5.0
+
+
+_CORNERS = _CornerRules()
 # The outermost pixels of the half image have no corners: their anchor would not fit into the full
 # image.
 _BORDER_PX = ANCHOR_REACH_PX // 2 + 2
@@ -46,14 +55,14 @@ def feature_spacing(width: int, height: int, grid: GridSettings) -> float:
 
 def min_distance_px(width: int, height: int, grid: GridSettings) -> int:
     """Least distance in pixels between features in an image of this size."""
-    return max(2, round(_MIN_DISTANCE * feature_spacing(width, height, grid)))
+    return max(2, round(_CORNERS.min_distance_share * feature_spacing(width, height, grid)))
 
 
 def grid_shape(width: int, height: int, grid: GridSettings) -> tuple[int, int]:
     """Rows and columns of the balancing grid: nearly square cells that hold `_CELL_FEATURES`
     features each.
     """
-    cell = feature_spacing(width, height, grid) * math.sqrt(_CELL_FEATURES)
+    cell = feature_spacing(width, height, grid) * math.sqrt(_CORNERS.cell_features)
     return max(1, round(height / cell)), max(1, round(width / cell))
 
 
@@ -269,7 +278,7 @@ def detect_corners(
     shape = grid_shape(2 * width, 2 * height, grid)
     cell = cell_index(2 * corners.astype(np.float64), 2 * width, 2 * height, shape)
     strength = response[corners[:, 1], corners[:, 0]]
-    share = np.float32(_MIN_RELATIVE_GRADIENT**2)
+    share = np.float32(_CORNERS.min_relative_gradient**2)
     kept = np.empty(len(cell), dtype=np.bool_)
     _keep_strong(strength, cell, share, np.zeros(shape[0] * shape[1], dtype=np.float32), kept)
     rows = kept.nonzero()[0]
@@ -280,7 +289,7 @@ def detect_corners(
         cell[rows], cell_index(occupied, 2 * width, 2 * height, shape), shape[0] * shape[1]
     )
     order = np.argsort(level, kind="stable")
-    chosen = corners[rows[order[level[order] < 2 * _CELL_FEATURES][:wanted]]]
+    chosen = corners[rows[order[level[order] < 2 * _CORNERS.cell_features][:wanted]]]
     peaks = np.empty((len(chosen), 2))
     _refine_peaks(response, chosen, peaks)
     return 2.0 * peaks
@@ -307,12 +316,12 @@ def _candidates(
     """
     height, width = half.shape
     distance = max(1, min_distance_px(2 * width, 2 * height, grid) // 2)
-    found = local_maxima(response, occupied / 2, distance, _BORDER_PX, _MIN_GRADIENT**2)
+    found = local_maxima(response, occupied / 2, distance, _BORDER_PX, _CORNERS.min_gradient**2)
     missing = grid.target_features - len(occupied)
     if len(found) >= missing:
         return found
-    floor = _MIN_GRADIENT_OVER_NOISE * noise_gradient(half) / 2.0
-    if floor >= _MIN_GRADIENT:
+    floor = _CORNERS.min_gradient_over_noise * noise_gradient(half) / 2.0
+    if floor >= _CORNERS.min_gradient:
         return found
     weaker = local_maxima(response, occupied / 2, distance, _BORDER_PX, floor**2)
     return weaker[np.argsort(-response[weaker[:, 1], weaker[:, 0]], kind="stable")[:missing]]

@@ -4,6 +4,8 @@ full image.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 
@@ -34,9 +36,17 @@ class _Flow:
 
 
 _FLOW = _Flow()
-_TRUSTED_LEVELS = 1  # pyramid levels above half resolution where the pixels are predicted
-_ITERATIONS = 20  # per level
-_MAX_FORWARD_BACKWARD_PX = 1.5
+
+
+class _TrackingRules(NamedTuple):
+    """How flow is tracked and checked."""
+
+    trusted_levels: int = 1  # pyramid levels above half resolution where the pixels are predicted
+    iterations: int = 20  # per level
+    max_forward_backward_px: float = 1.5
+
+
+_TRACKING = _TrackingRules()
 
 
 def track_with_retries(
@@ -66,7 +76,7 @@ def track_with_retries(
         Pixels (N, 2), and a mask (N,) of those found.
     """
     last = match_brightness(last, view.half)
-    few = min(_TRUSTED_LEVELS, levels) if trusted else levels
+    few = min(_TRACKING.trusted_levels, levels) if trusted else levels
     found, good = _track_forward_backward(last, view, points, guess, few, trusted=trusted)
     attempts = (
         [(guess, _FLOW.retry_share), (points, _FLOW.lost_share)]
@@ -119,7 +129,7 @@ def _track_forward_backward(
     """
     forward, good = _flow(last, view.half, points, guess, levels)
     good &= inside(view.full, forward, ANCHOR_REACH_PX + 2)
-    tolerance = _MAX_FORWARD_BACKWARD_PX
+    tolerance = _TRACKING.max_forward_backward_px
     doubtful = (good & _apart(forward, guess, tolerance) if trusted else good).nonzero()[0]
     if len(doubtful):
         before = points.take(doubtful, axis=0)
@@ -156,7 +166,7 @@ def _flow(
         target,
         points / 2,
         guess / 2,
-        PyramidSearch(_FLOW.window_px, levels, _ITERATIONS, _FLOW.lk_epsilon_px),
+        PyramidSearch(_FLOW.window_px, levels, _TRACKING.iterations, _FLOW.lk_epsilon_px),
     )
     pixels *= 2
     lost = (~seen).nonzero()[0]

@@ -5,7 +5,7 @@ along the row.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -62,15 +62,31 @@ from vio.records import (
     TrackPrior,
 )
 
-# extra corners tried, over the number of missing features; the best stereo matches are kept
-_SPARE_CORNERS = 1.5
-# for which a new corner must be tracked, in time and stereo, before it is output
-_PROBATION_FRAMES = 1
-_FEW_MISSING = 0.1  # share of the features; detection takes more time than it is worth for fewer
-_VERY_FEW = 0.25  # share of the target below which new features are output at once
-_LONG_GAP_S = 0.8  # a rig that flies or is carried shows other things after it …
-_LONG_GAP_STEPS = 5.0  # … where frames usually come so many times as often
-_BANK_SPARE = 3  # templates allocated, over the number of features
+
+class _NewRules(NamedTuple):
+    """When new corners are added and output."""
+
+    # extra corners tried, over the number of missing features; the best stereo matches are kept
+    spare_corners: float = 1.5
+    # for which a new corner must be tracked, in time and stereo, before it is output
+    probation_frames: int = 1
+    # share of the features; detection takes more time than it is worth for fewer
+    few_missing_share: float = 0.1
+    very_few_share: float = 0.25  # share of the target below which new features are output at once
+    bank_factor: int = 3  # templates allocated, over the number of features
+
+
+_NEW = _NewRules()
+
+
+class _LongGapRules(NamedTuple):
+    """When tracks are not followed over a gap."""
+
+    min_s: float = 0.8  # a rig that flies or is carried shows other things after it …
+    min_steps: float = 5.0  # … where frames usually come so many times as often
+
+
+_LONG_GAP = _LongGapRules()
 
 
 class KltFrontend:
@@ -103,7 +119,7 @@ class KltFrontend:
         self._right = RightCamera()
         self._delay = RightDelay(camera)
         self._objects = ObjectReport()
-        self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, ANCHOR_RADIUS_PX)
+        self._bank = AnchorBank(_NEW.bank_factor * self._grid.target_features, ANCHOR_RADIUS_PX)
         self._anchor_fit = AnchorFit(camera, self._grid, self._bank)
         self._new_features = NewFeatures(camera, self._grid, self._bank)
         self._matcher = RightMatcher(camera, self._right, self._delay)
@@ -189,8 +205,8 @@ class KltFrontend:
         """
         target = self._grid.target_features
         missing = target - active
-        self._rested = not self._rested and missing <= _FEW_MISSING * target
-        return 0 if self._rested else round(missing * (1.0 + _SPARE_CORNERS))
+        self._rested = not self._rested and missing <= _NEW.few_missing_share * target
+        return 0 if self._rested else round(missing * (1.0 + _NEW.spare_corners))
 
     def _take_findings(self) -> tuple[Finding, ...]:
         """Return what was found since the last frame."""
@@ -375,7 +391,7 @@ class KltFrontend:
         if self._previous is None or self._step_ns is None:
             return False
         gap_ns = frame.time_ns - self._previous.time_ns
-        return gap_ns > max(_LONG_GAP_S * 1e9, _LONG_GAP_STEPS * self._step_ns)
+        return gap_ns > max(_LONG_GAP.min_s * 1e9, _LONG_GAP.min_steps * self._step_ns)
 
     def _reject_outliers(
         self,
@@ -453,8 +469,8 @@ class KltFrontend:
         if these are few.
         """
         proven = tracks.has_right | (not self._needs_right)
-        proven = tracks.shown | ((tracks.age >= _PROBATION_FRAMES) & proven)
-        if proven.sum() < _VERY_FEW * self._grid.target_features:
+        proven = tracks.shown | ((tracks.age >= _NEW.probation_frames) & proven)
+        if proven.sum() < _NEW.very_few_share * self._grid.target_features:
             proven[:] = True
         ids = tracks.ids.copy()
         first = proven & ~tracks.shown

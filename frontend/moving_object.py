@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -44,34 +44,67 @@ from vio.records import BoolArray, IntArray, MotionPrior
 
 Decision: TypeAlias = Literal["predicted", "voted", "undecided", "unsupported"]
 
-_PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
-_LIMIT = float(chi_square_quantile(_PROBABILITY, 6))  # of its squared distance
-# ratio of two motions' squared distances from a measured one, above which the nearer agrees
-_CLEARLY_NEARER = 10.0
-_MIN_POINTS = 12  # of a second motion
-_MIN_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
-_LARGE_SHARE = 0.25  # share of all points above which a second motion is reported
-# of the smaller group's points that no depth within the disparities' error explains: an object
-_SEEN_SHARE = 0.5
-_BOUND_SIGMAS = 3.0  # of the bound of the disparities' error
-_PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
-# errors of neighbours have much in common: a fit is no better than that of so many points
-_INDEPENDENT_POINTS = 50
-_MIN_STATIC = 0.8  # share of a consensus without depths that a measured motion must explain
-_FAR_M = 1e4  # depth of what is infinitely far away
-# of the length of a fitted translation: depths of one frame have errors in common
-_SCALE_SIGMA = 0.01
-# errors of points of the scene over the median of those that are static for long: of 1000 one more
-_FOLLOWING = 3.2
-_VOTERS = 50  # how many points vote, and for how many frames each must have been static
-_VOTING_FRAMES = 5
-_CLEAR_VOTE = 0.7  # share of the voting points that must follow a motion
-_FRAMES = 5  # in a row before an object is reported
-_EVENT_FRAMES = 2  # in a row before an object is known, and may hide the scene
-# of the points that the scene has, during an event, below which the object hides it …
-_HIDDEN_SHARE = 0.1
-_HIDDEN_FRAMES = 3  # … in so many frames in a row
-_CLEAR_FRAMES = 20  # without one before the next is another event
+
+class _AgreementRules(NamedTuple):
+    """When a motion agrees with a measured one."""
+
+    probability: float = 0.9999  # of a motion that agrees with the prediction to pass the test
+    # ratio of two motions' squared distances from a measured one, above which the nearer agrees
+    nearer_ratio: float = 10.0
+    bound_sigmas: float = 3.0  # of the bound of the disparities' error
+    pixel_sigma_px: float = 0.5  # of a point's position by its depth and its track
+    # errors of neighbours have much in common: a fit is no better than that of so many points
+    independent_points: int = 50
+    # share of a consensus without depths that a measured motion must explain
+    min_static_share: float = 0.8
+    far_m: float = 1e4  # depth of what is infinitely far away
+    # of the length of a fitted translation: depths of one frame have errors in common
+    scale_sigma: float = 0.01
+
+
+_AGREEMENT = _AgreementRules()
+_LIMIT = float(chi_square_quantile(_AGREEMENT.probability, 6))  # of its squared distance
+
+
+class _SecondMotion(NamedTuple):
+    """When a second motion counts."""
+
+    min_points: int = 12  # of a second motion
+    # points of a second motion that may replace the first, over the first's
+    min_support_share: float = 0.1
+    large_share: float = 0.25  # share of all points above which a second motion is reported
+    # of the smaller group's points that no depth within the disparities' error explains: an object
+    seen_share: float = 0.5
+
+
+_SECOND = _SecondMotion()
+
+
+class _VoteRules(NamedTuple):
+    """How points that were static for long vote."""
+
+    # errors of points of the scene over the median of those that are static for long: of 1000 one more
+    following_ratio: float = 3.2
+    voters: int = 50  # how many points vote, and for how many frames each must have been static
+    static_frames: int = 5
+    clear_share: float = 0.7  # share of the voting points that must follow a motion
+
+
+_VOTE = _VoteRules()
+
+
+class _EventRules(NamedTuple):
+    """When an object is reported, and hides the scene."""
+
+    reported_frames: int = 5  # in a row before an object is reported
+    known_frames: int = 2  # in a row before an object is known, and may hide the scene
+    # of the points that the scene has, during an event, below which the object hides it …
+    hidden_share: float = 0.1
+    hidden_frames: int = 3  # … in so many frames in a row
+    clear_frames: int = 20  # without one before the next is another event
+
+
+_EVENT = _EventRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +153,7 @@ def choose_motion(
         if voted is not None and not _prediction_overrules(p_prev, found, voted, expected):
             return TwoMotions(voted, _if_large((found.inliers & ~voted.inliers).mean()), "voted")
     others = np.flatnonzero(~found.inliers)
-    least = max(_MIN_POINTS, _MIN_SUPPORT * found.inliers.sum())
+    least = max(_SECOND.min_points, _SECOND.min_support_share * found.inliers.sum())
     of_first = np.inf
     is_far = expected is not None and expected.is_beyond(found.T_curr_prev, _LIMIT)
     if expected is not None and (len(others) >= least or in_event or is_far):
@@ -165,7 +198,7 @@ def choose_motion(
     of_second = expected.distance(second, p_prev[others[support]]) if large else np.inf
     nearer, farther = sorted((of_first, of_second))
     limit = _LIMIT
-    if measured and large and nearer * _CLEARLY_NEARER <= farther:
+    if measured and large and nearer * _AGREEMENT.nearer_ratio <= farther:
         # the sensor is worse than its covariance, but leaves no doubt which one it is
         limit = max(limit, nearer)
     first_agrees = of_first <= limit
@@ -202,7 +235,7 @@ def _prediction_overrules(
 
 def _if_large(share: float) -> float:
     """The share of an object that is reported; 0 for a small one."""
-    return float(share) if share >= _LARGE_SHARE else 0.0
+    return float(share) if share >= _SECOND.large_share else 0.0
 
 
 def _followers(
@@ -227,13 +260,13 @@ def _near_prediction(
     """
     start = expected.prior.T_curr_prev
     near = pixel_errors(problem.camera, start, p_prev, pixels) <= 2.0 * problem.limit_px
-    if near.sum() < _MIN_POINTS:
+    if near.sum() < _SECOND.min_points:
         return None
     T, _ = best_motion(problem, p_prev[near], pixels[near], start[None])
     inliers = _followers(problem, T, p_prev, pixels)
     alone = inliers & ~found.inliers
     others = found.inliers & ~inliers
-    if alone.sum() < max(_MIN_POINTS, _MIN_SUPPORT * others.sum()):
+    if alone.sum() < max(_SECOND.min_points, _SECOND.min_support_share * others.sum()):
         return None
     return Consensus(T, inliers) if expected.distance(T, p_prev[inliers]) <= _LIMIT else None
 
@@ -253,17 +286,17 @@ def _without_slow_object(
     it along.
     """
     old = voting & found.inliers
-    if old.sum() < _MIN_POINTS:
+    if old.sum() < _SECOND.min_points:
         return None
     T, _ = best_motion(problem, p_prev[old], pixels[old], expected.prior.T_curr_prev[None])
     errors = pixel_errors(problem.camera, T, p_prev, pixels)
-    usual_px = _FOLLOWING * float(np.median(errors[old]))
+    usual_px = _VOTE.following_ratio * float(np.median(errors[old]))
     follows = np.asarray(errors <= min(usual_px, problem.limit_px))
     moving = found.inliers & ~follows
     # old points that do not follow: the scene is no better known than what came into view
-    if moving.sum() < max(_MIN_POINTS, _LARGE_SHARE * len(p_prev)):
+    if moving.sum() < max(_SECOND.min_points, _SECOND.large_share * len(p_prev)):
         return None
-    if (moving & voting).sum() > (1.0 - _CLEAR_VOTE) * voting.sum():
+    if (moving & voting).sum() > (1.0 - _VOTE.clear_share) * voting.sum():
         return None
     return Consensus(T, follows) if expected.distance(T, p_prev[old]) <= _LIMIT else None
 
@@ -276,14 +309,18 @@ def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] 
     """
     for_first = int((first & ~second).sum())
     for_second = int((second & ~first).sum())
-    if max(for_first, for_second) < max(_MIN_POINTS, _CLEAR_VOTE * (for_first + for_second)):
+    if max(for_first, for_second) < max(
+        _SECOND.min_points, _VOTE.clear_share * (for_first + for_second)
+    ):
         return None
     return "first" if for_first > for_second else "second"
 
 
 def _votes_for(found: Consensus, voting: BoolArray) -> bool:
     """Whether most of the voting points (N,) follow a motion."""
-    return bool(voting.sum() >= _MIN_POINTS and found.inliers[voting].mean() >= _CLEAR_VOTE)
+    return bool(
+        voting.sum() >= _SECOND.min_points and found.inliers[voting].mean() >= _VOTE.clear_share
+    )
 
 
 def _voted(
@@ -296,11 +333,11 @@ def _voted(
     """Return the motion that most of the voting points (N,) follow, where the consensus is not
     theirs; else None.
     """
-    if voting.sum() < _MIN_POINTS or _votes_for(found, voting):
+    if voting.sum() < _SECOND.min_points or _votes_for(found, voting):
         return None
     starts = np.stack([found.T_curr_prev, np.eye(4)])
     T, follows = best_motion(problem, p_prev[voting], pixels[voting], starts)
-    if follows.mean() < _CLEAR_VOTE:
+    if follows.mean() < _VOTE.clear_share:
         return None
     inliers = _followers(problem, T, p_prev, pixels)
     # the oldest points may all be far away
@@ -331,7 +368,7 @@ def static_by_prediction(
         near_m: the smallest depth.
     """
     static = _agree_with(problem.camera, predicted, before, after, near_m, problem.limit_px)
-    if static.sum() < _MIN_POINTS or share_of(static[kept]) >= _MIN_STATIC:
+    if static.sum() < _SECOND.min_points or share_of(static[kept]) >= _AGREEMENT.min_static_share:
         return kept
     return static
 
@@ -364,14 +401,14 @@ def _agree_with(
     across = np.cross(seen, T[:3, 3])
     off = np.cross(seen, turned)
     inverse = -np.sum(across * off, axis=1) / (np.sum(across * across, axis=1) + 1e-12)
-    p = turned / np.clip(inverse, 1.0 / _FAR_M, 1.0 / near_m)[:, None] + T[:3, 3]
+    p = turned / np.clip(inverse, 1.0 / _AGREEMENT.far_m, 1.0 / near_m)[:, None] + T[:3, 3]
     ahead = depth_of(camera, p) > 0.0
     p[~ahead] = [0.0, 0.0, 1.0]
     J = _pixel_D_motion(camera, p)
     S = J @ predicted.covariance @ J.transpose(0, 2, 1) + sigma_px**2 * np.eye(2)
     d = after - project(camera, p)[:, :2]
     squared = np.sum(d * np.linalg.solve(S, d[..., None])[..., 0], axis=1)
-    return np.asarray(ahead & (squared <= float(chi_square_quantile(_PROBABILITY, 1))))
+    return np.asarray(ahead & (squared <= float(chi_square_quantile(_AGREEMENT.probability, 1))))
 
 
 def one_motion_explains(
@@ -401,7 +438,7 @@ def one_motion_explains(
     off = ~static | ~_within_depths(problem, motion.T_curr_prev, p_prev, pixels, disparity_error_px)
     # of the groups: the larger one is fitted
     smaller = min(chosen.object_share, share_of(motion.inliers))
-    return float(off.mean()) < _SEEN_SHARE * smaller
+    return float(off.mean()) < _SECOND.seen_share * smaller
 
 
 def _within_depths(
@@ -423,7 +460,7 @@ def _within_depths(
     span = 2.0 * disparity_error_px * (1.0 + aside * aside)
     ends = []
     for off in (-span, span):
-        changed = np.maximum(disparity + off, constant / _FAR_M)
+        changed = np.maximum(disparity + off, constant / _AGREEMENT.far_m)
         p = transform_points(T, p_prev * (disparity / changed)[:, None])
         ahead = depth_of(camera, p) > 0.0
         p[~ahead] = [0.0, 0.0, 1.0]
@@ -450,15 +487,17 @@ class _Expected:
         """
         p = transform_points(T, p_prev)
         J = _pixel_D_motion(self.camera, p).reshape(-1, 6)
-        points = min(len(p), _INDEPENDENT_POINTS)
-        fit = _PIXEL_SIGMA**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
+        points = min(len(p), _AGREEMENT.independent_points)
+        fit = _AGREEMENT.pixel_sigma_px**2 * np.linalg.inv(
+            points * J.T @ J / len(p) + 1e-9 * np.eye(6)
+        )
         moved_m2 = float(T[:3, 3] @ T[:3, 3])
-        fit[:3, :3] += _SCALE_SIGMA**2 * moved_m2 * np.eye(3)
+        fit[:3, :3] += _AGREEMENT.scale_sigma**2 * moved_m2 * np.eye(3)
         if self.disparity_error_px > 0.0:
             # a translation is off as its depths are; one that no sensor has measured is, too
             depth = float(np.median(depth_of(self.camera, p_prev)))
             f_baseline = self.camera.fu * self.camera.baseline_m
-            scale = self.disparity_error_px / _BOUND_SIGMAS * depth / f_baseline
+            scale = self.disparity_error_px / _AGREEMENT.bound_sigmas * depth / f_baseline
             if not self.prior.measured:
                 t = self.prior.T_curr_prev[:3, 3]
                 moved_m2 += float(t @ t)
@@ -491,8 +530,12 @@ def voters(age: IntArray) -> BoolArray:
     What has come into view, and moves slowly enough to pass for static, is younger than what was
     there before.
     """
-    oldest = np.partition(age, len(age) - _VOTERS)[len(age) - _VOTERS] if len(age) > _VOTERS else 0
-    return np.asarray(age >= max(oldest, _VOTING_FRAMES))
+    oldest = (
+        np.partition(age, len(age) - _VOTE.voters)[len(age) - _VOTE.voters]
+        if len(age) > _VOTE.voters
+        else 0
+    )
+    return np.asarray(age >= max(oldest, _VOTE.static_frames))
 
 
 class ObjectReport(Finder):
@@ -503,7 +546,7 @@ class ObjectReport(Finder):
     def __init__(self) -> None:
         super().__init__()
         # squared distances from the prediction of motions that older points support
-        self._usual = deque[float](maxlen=_CLEAR_FRAMES)
+        self._usual = deque[float](maxlen=_EVENT.clear_frames)
         self._frames = 0  # with an object, in a row
         self._since = 0  # the first of them
         self._clear = 0  # without one, in a row
@@ -535,8 +578,8 @@ class ObjectReport(Finder):
         """
         motion = motions.motion
         expected = _Expected(camera, predicted, disparity_error_px)
-        supported = int((motion.inliers & voting).sum()) >= _MIN_POINTS
-        limit = _LIMIT if supported else _CLEARLY_NEARER * max([_LIMIT, *self._usual])
+        supported = int((motion.inliers & voting).sum()) >= _SECOND.min_points
+        limit = _LIMIT if supported else _AGREEMENT.nearer_ratio * max([_LIMIT, *self._usual])
         distance = 0.0
         if expected.is_beyond(motion.T_curr_prev, limit):
             distance = expected.distance(motion.T_curr_prev, p_prev[motion.inliers])
@@ -550,16 +593,16 @@ class ObjectReport(Finder):
         """Return whether a known object has left too few points of the scene for some frames, so
         that none is used.
         """
-        hidden = self._active and float(motions.motion.inliers.mean()) < _HIDDEN_SHARE
+        hidden = self._active and float(motions.motion.inliers.mean()) < _EVENT.hidden_share
         self._hidden = self._hidden + 1 if hidden else 0
-        if self._hidden >= _HIDDEN_FRAMES and not self._hidden_reported:
+        if self._hidden >= _EVENT.hidden_frames and not self._hidden_reported:
             self._hidden_reported = True
             message = (
-                f"frame {index}: fewer than {100 * _HIDDEN_SHARE:.0f} % of the points are left of "
+                f"frame {index}: fewer than {100 * _EVENT.hidden_share:.0f} % of the points are left of "
                 "the scene: the object hides it, and no feature is used"
             )
             self._found.append(Finding("object-hides-scene", message, index, lasts=True))
-        return self._hidden >= _HIDDEN_FRAMES
+        return self._hidden >= _EVENT.hidden_frames
 
     def frame(self, index: int, motions: TwoMotions) -> None:
         """Take the motions of a frame."""
@@ -574,15 +617,15 @@ class ObjectReport(Finder):
             self._report_unsupported(index, motions)
             return
         undecided = motions.decision == "undecided"
-        self._active = self._active or (self._frames >= _EVENT_FRAMES and not undecided)
-        if self._frames >= _FRAMES and self._reported is None:
+        self._active = self._active or (self._frames >= _EVENT.known_frames and not undecided)
+        if self._frames >= _EVENT.reported_frames and self._reported is None:
             self._report(index, motions)
 
     def _no_object(self, index: int) -> None:
         self._frames = 0
         self._clear = self._clear + 1
-        self._active = self._active and self._clear < _FRAMES
-        if self._reported is None or self._clear < _CLEAR_FRAMES:
+        self._active = self._active and self._clear < _EVENT.reported_frames
+        if self._reported is None or self._clear < _EVENT.clear_frames:
             return
         message = f"frame {index}: no object covers much of the image any more"
         self._found.append(Finding(self._reported, message, index, ended=True))

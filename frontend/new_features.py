@@ -4,6 +4,8 @@ a match.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.frontend.align import rounded
@@ -17,12 +19,20 @@ from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
 from vio.records import BoolArray, Image, IntArray
 
-# share of the target below which corners that leave the image sooner are added, too
-_MIN_FEATURES = 0.7
-_WANTED_LIFE_FRAMES = 7  # for which a new corner should stay in the image
-_MAX_LEFT_ONLY_FRAMES = 10  # in a row without a right match, before a feature is dropped
-_FEW = 0.5  # share of the least number of features below which corners without depth are added
-_TRIED = 1.5  # corners aligned per missing feature
+
+class _NewRules(NamedTuple):
+    """Which corners become features."""
+
+    # share of the target below which corners that leave the image sooner are added, too
+    min_features_share: float = 0.7
+    wanted_life_frames: int = 7  # for which a new corner should stay in the image
+    max_left_only_frames: int = 10  # in a row without a right match, before a feature is dropped
+    # share of the least number of features below which corners without depth are added
+    few_share: float = 0.5
+    tried_factor: float = 1.5  # corners aligned per missing feature
+
+
+_NEW = _NewRules()
 
 
 class NewFeatures:
@@ -123,7 +133,7 @@ class NewFeatures:
         tracks = changed(
             tracks, left_only_frames=np.where(tracks.has_right, 0, tracks.left_only_frames + 1)
         )
-        return take(tracks, tracks.left_only_frames <= _MAX_LEFT_ONLY_FRAMES)
+        return take(tracks, tracks.left_only_frames <= _NEW.max_left_only_frames)
 
     def _select_corners(
         self, tracks: Tracks, unique: BoolArray, stays: BoolArray, delayed: bool
@@ -138,13 +148,17 @@ class NewFeatures:
         target = self._grid.target_features
         matched = int(tracks.has_right.sum())
         room = max(0, target - len(tracks))
-        least = _MIN_FEATURES * target
-        tried = round(_TRIED * room)
+        least = _NEW.min_features_share * target
+        tried = round(_NEW.tried_factor * room)
         staying = (unique & stays).nonzero()[0][:tried]
         leaving = (unique & ~stays).nonzero()[0][:tried]
-        leaving = leaving[: max(0, round(_TRIED * (least - matched - len(staying) / _TRIED)))]
+        leaving = leaving[
+            : max(
+                0, round(_NEW.tried_factor * (least - matched - len(staying) / _NEW.tried_factor))
+            )
+        ]
         no_depth = (~unique).nonzero()[0][:room]
-        if matched > _FEW * least and not delayed:
+        if matched > _NEW.few_share * least and not delayed:
             no_depth = no_depth[:0]
         return np.concatenate([staying, leaving, no_depth]), len(staying) + len(leaving)
 
@@ -156,7 +170,7 @@ class NewFeatures:
         """
         if motion is None:
             return np.ones(len(corners), dtype=np.bool_)
-        T = np.linalg.matrix_power(motion.T_curr_prev, _WANTED_LIFE_FRAMES)
+        T = np.linalg.matrix_power(motion.T_curr_prev, _NEW.wanted_life_frames)
         depth = self._camera.fu * self._camera.baseline_m / np.maximum(disparity, 0.1)
         moved = transform_points(T, left_rays(self._camera, corners) * depth[:, None])
         ahead = depth_of(self._camera, moved) > 0.5

@@ -31,7 +31,22 @@ from vio.numerics.robust import median
 from vio.records import BoolArray, IntArray
 
 _MIN_DEPTH_M = 0.05
-_SAMPLES = 96  # random minimal sets of RANSAC
+
+
+class _RansacRules(NamedTuple):
+    """When points agree on a motion."""
+
+    samples: int = 96  # random minimal sets of RANSAC
+    # inliers of the prior motion only, over the consensus', above which it replaces the consensus
+    prior_min_support_share: float = 0.4
+    min_points: int = 8  # with fewer points, a consensus may be chance
+    min_share: float = 0.2  # smallest share of inliers of a consensus
+    refine_iterations: int = 6
+    # change of a motion, in radians and metres, below which it is not refined further
+    converged_change: float = 3e-6
+
+
+_RANSAC = _RansacRules()
 
 
 class _ConsensusRules(NamedTuple):
@@ -59,13 +74,6 @@ class _ConsensusRules(NamedTuple):
 
 
 _CONSENSUS = _ConsensusRules()
-# inliers of the prior motion only, over the consensus', above which it replaces the consensus
-_PRIOR_MIN_SUPPORT = 0.4
-_MIN_POINTS = 8  # with fewer points, a consensus may be chance
-_MIN_SHARE = 0.2  # smallest share of inliers of a consensus
-_REFINE_ITERATIONS = 6
-# change of a motion, in radians and metres, below which it is not refined further
-_CONVERGED = 3e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +293,7 @@ def _refine(
     pixels: FloatArray,
     scale_px: float,
     free: slice,
-    converged: float = _CONVERGED,
+    converged: float = _RANSAC.converged_change,
 ) -> FloatArray:
     """Refine one motion (4, 4) on all points, with Geman-McClure weights."""
     T = np.array(T[None], order="C")
@@ -296,7 +304,7 @@ def _refine(
         camera_args(camera),
         T,
         _Seen(points[None], seen[None], equal),
-        _Steps(scale_px, _REFINE_ITERATIONS, free.stop, converged),
+        _Steps(scale_px, _RANSAC.refine_iterations, free.stop, converged),
     )
     return T[0]
 
@@ -314,7 +322,7 @@ def _ransac(
     inliers = pixel_errors(camera, refined, p_prev, pixels) <= limit
     if share_of(inliers) >= _CONSENSUS.sure_share:
         return refined, inliers
-    sets = problem.rng.integers(0, len(p_prev), size=(_SAMPLES, 3))
+    sets = problem.rng.integers(0, len(p_prev), size=(_RANSAC.samples, 3))
     T = np.broadcast_to(begin, (len(sets), 4, 4))
     T = _gauss_newton(
         camera,
@@ -428,7 +436,7 @@ def rigid_consensus(
     Returns:
         None with too few points or too few inliers.
     """
-    if len(p_prev) < _MIN_POINTS:
+    if len(p_prev) < _RANSAC.min_points:
         return None
     starts = [expected, np.eye(4)]
     if R_prior is not None:
@@ -438,7 +446,7 @@ def rigid_consensus(
     T, inliers = _ransac(problem, p_prev, pixels, np.stack(starts), slice(0, 6))
     # Only outliers of the consensus support another motion: a prior that agrees with the consensus
     # is not tried.
-    needed = max(_MIN_POINTS, _PRIOR_MIN_SUPPORT * inliers.sum())
+    needed = max(_RANSAC.min_points, _RANSAC.prior_min_support_share * inliers.sum())
     if (~inliers).sum() >= needed:
         for T_near in _prior_candidates(problem, p_prev, pixels, T, expected, R_prior, T_prior):
             kept = pixel_errors(problem.camera, T_near, p_prev, pixels) <= problem.limit_px
@@ -453,7 +461,7 @@ def rigid_consensus(
                 )
                 inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
                 break
-    if inliers.sum() < max(_MIN_POINTS, _MIN_SHARE * len(inliers)):
+    if inliers.sum() < max(_RANSAC.min_points, _RANSAC.min_share * len(inliers)):
         return None
     return Consensus(T, inliers)
 
@@ -570,7 +578,7 @@ def predicted_motion(
     few = slice(None, None, max(1, len(p_prev) // _CONSENSUS.prior_points))
     p = p_prev[few]
     z = pixels[few]
-    if len(p) < _MIN_POINTS:
+    if len(p) < _RANSAC.min_points:
         return None
     T = expected
     weight = np.ones((1, len(p)))
@@ -624,7 +632,7 @@ def bearing_consensus(
     Returns:
         Mask (N,) of the inliers; None with too few tracks, or if most are outliers.
     """
-    if len(previous) < _MIN_POINTS:
+    if len(previous) < _RANSAC.min_points:
         return None
     camera = problem.camera
     seen = _TwoViews(left_rays(camera, previous), current, left_rays(camera, current))
@@ -643,10 +651,14 @@ def bearing_consensus(
     ):
         # A wrong prior shares some inliers with the consensus: only outliers of the consensus
         # support the prior.
-        supported = (near_prior & ~kept).sum() >= max(_MIN_POINTS, _PRIOR_MIN_SUPPORT * kept.sum())
+        supported = (near_prior & ~kept).sum() >= max(
+            _RANSAC.min_points, _RANSAC.prior_min_support_share * kept.sum()
+        )
         kept = near_prior if supported else kept
     return (
-        kept if kept.sum() >= max(_MIN_POINTS, _CONSENSUS.min_bearing_share * len(kept)) else None
+        kept
+        if kept.sum() >= max(_RANSAC.min_points, _CONSENSUS.min_bearing_share * len(kept))
+        else None
     )
 
 
@@ -716,7 +728,7 @@ def _bearing_ransac(
         ]
     T = np.concatenate(models)
     best = T[int(np.argmin(_cost(problem, seen, T[:, :3, :3], T[:, :3, 3])))]
-    for _ in range(_REFINE_ITERATIONS):
+    for _ in range(_RANSAC.refine_iterations):
         better = _bearing_step(problem, seen, best)
         if _cost(problem, seen, better[:3, :3], better[:3, 3]) >= _cost(
             problem, seen, best[:3, :3], best[:3, 3]
@@ -776,7 +788,7 @@ def _pure_rotation(problem: RansacProblem, seen: _TwoViews) -> FloatArray:
 
 def _pairs(count: int, problem: RansacProblem) -> IntArray:
     """Random pairs (H, 2) of different indices below `count`."""
-    first = problem.rng.integers(0, count, size=_SAMPLES)
+    first = problem.rng.integers(0, count, size=_RANSAC.samples)
     return np.stack(
         [first, (first + problem.rng.integers(1, count, size=len(first))) % count], axis=1
     )
@@ -803,13 +815,13 @@ def _five_point(
     camera = problem.camera
     if camera.is_cylinder:
         previous, current = _pinhole_pixels(camera, previous, current)
-        if len(current) < _MIN_POINTS:
+        if len(current) < _RANSAC.min_points:
             return None
     K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
     params = cv2.UsacParams()
     params.confidence = _CONSENSUS.five_point_confidence
     params.threshold = problem.limit_px
-    params.maxIterations = 10 * _SAMPLES
+    params.maxIterations = 10 * _RANSAC.samples
     params.randomGeneratorState = int(problem.rng.integers(0, 2**31 - 1))
     params.isParallel = False
     none = np.zeros(4)

@@ -9,6 +9,8 @@ measures.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.frontend.columns import share_of
@@ -22,12 +24,20 @@ from vio.geometry.stereo import depth_of, left_rays
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import MotionPrior
 
-_MIN_POINTS = 15  # that must agree on the motion …
-_MIN_SHARE = 0.4  # … and of all matches with depths
-_DEPTHS_AGREE = 0.5  # share of these whose new disparity must be that of the moved point
-_ROTATION_SIGMA_DEG = 0.3  # of a motion by key points
-_ROTATION_PROBABILITY = 0.9999  # of a rotation measured beside it
-_DISPARITY_PX = 2.0  # as far as whole pixels at half resolution tell
+
+class _ReappearanceRules(NamedTuple):
+    """When key points show the motion across a time without images."""
+
+    min_points: int = 15  # that must agree on the motion …
+    min_share: float = 0.4  # … and of all matches with depths
+    # share of these whose new disparity must be that of the moved point
+    min_depths_share: float = 0.5
+    rotation_sigma_deg: float = 0.3  # of a motion by key points
+    rotation_probability: float = 0.9999  # of a rotation measured beside it
+    disparity_px: float = 2.0  # as far as whole pixels at half resolution tell
+
+
+_AGAIN = _ReappearanceRules()
 
 
 def contradicts_gyro(T_curr_prev: FloatArray, predicted: MotionPrior | None) -> bool:
@@ -37,9 +47,11 @@ def contradicts_gyro(T_curr_prev: FloatArray, predicted: MotionPrior | None) -> 
     if predicted is None or not predicted.measured:
         return False
     phi = so3_log(T_curr_prev[:3, :3] @ predicted.T_curr_prev[:3, :3].T)
-    covariance = predicted.covariance[3:, 3:] + np.radians(_ROTATION_SIGMA_DEG) ** 2 * np.eye(3)
+    covariance = predicted.covariance[3:, 3:] + np.radians(_AGAIN.rotation_sigma_deg) ** 2 * np.eye(
+        3
+    )
     return bool(
-        phi @ np.linalg.solve(covariance, phi) > chi_square_quantile(_ROTATION_PROBABILITY, 3)
+        phi @ np.linalg.solve(covariance, phi) > chi_square_quantile(_AGAIN.rotation_probability, 3)
     )
 
 
@@ -75,16 +87,16 @@ def motion_across(
     a = a[known]
     b = b[known]
     d_before = d_before[known]
-    if len(a) < _MIN_POINTS:
+    if len(a) < _AGAIN.min_points:
         return None
     f_baseline = camera.fu * camera.baseline_m
     points = left_rays(camera, a) * (f_baseline / d_before)[:, None]
     T, agree = best_motion(problem, points, b, starts)
-    if agree.sum() < max(_MIN_POINTS, _MIN_SHARE * len(agree)):
+    if agree.sum() < max(_AGAIN.min_points, _AGAIN.min_share * len(agree)):
         return None
     d_now, known = stereo.search(left.half, right.half, b[agree])
     depth = depth_of(camera, transform_points(T, points[agree]))
-    same = np.abs(d_now - f_baseline / np.maximum(depth, 1e-3)) <= _DISPARITY_PX
-    if known.sum() < _MIN_POINTS or share_of(same[known]) < _DEPTHS_AGREE:
+    same = np.abs(d_now - f_baseline / np.maximum(depth, 1e-3)) <= _AGAIN.disparity_px
+    if known.sum() < _AGAIN.min_points or share_of(same[known]) < _AGAIN.min_depths_share:
         return None
     return T

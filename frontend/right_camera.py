@@ -9,18 +9,28 @@ until they agree again. That its image is frozen or dark, `vio.guard` sees befor
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from vio.findings import Finder, Finding
 from vio.frontend.columns import share_of
 from vio.records import BoolArray
 
-_MIN_POINTS = 20  # with fewer points of known depth, matches say nothing
-# but so few suffice to agree, as hardly any wrong one is found where it should be
-_MIN_AGREEING = 6
-# share of confirmed points below which the images contradict each other; usual is 0.8 to 1
-_CONTRADICTS = 0.3
-_AGREES = 0.6  # share above which they agree again
-_FRAMES = 3  # in a row before it is reported, or before images that agree are used again
-_BLIND_FRAMES = 40  # after as many without points to test by, the right image is tried again
+
+class _ContradictionRules(NamedTuple):
+    """When right and left images contradict each other."""
+
+    min_points: int = 20  # with fewer points of known depth, matches say nothing
+    # but so few suffice to agree, as hardly any wrong one is found where it should be
+    min_agreeing: int = 6
+    # share of confirmed points below which the images contradict each other; usual is 0.8 to 1
+    contradicting_share: float = 0.3
+    agreeing_share: float = 0.6  # share above which they agree again
+    frames: int = 3  # in a row before it is reported, or before images that agree are used again
+    # after as many without points to test by, the right image is tried again
+    blind_frames: int = 40
+
+
+_CONTRADICTION = _ContradictionRules()
 _CODE = "right-contradicts-left"
 
 
@@ -86,7 +96,11 @@ class RightCamera(Finder):
         """Whether so few of the points (K,) of known depth are where they should be that a cause
         is looked for.
         """
-        return self._lives and len(matched) >= _MIN_POINTS and share_of(matched) < _AGREES
+        return (
+            self._lives
+            and len(matched) >= _CONTRADICTION.min_points
+            and share_of(matched) < _CONTRADICTION.agreeing_share
+        )
 
     def check_matches(self, index: int, matched: BoolArray, *, moved: bool) -> bool:
         """Judge the matches of a frame near their known depths, and return whether the right image
@@ -100,22 +114,26 @@ class RightCamera(Finder):
         """
         if not self._lives:
             return False
-        tested = moved and len(matched) >= _MIN_POINTS
+        tested = moved and len(matched) >= _CONTRADICTION.min_points
         share = share_of(matched) if len(matched) else 0.0
         if not self._contradicts:
-            if tested and share < _CONTRADICTS:
+            if tested and share < _CONTRADICTION.contradicting_share:
                 self._begin(index)
             return not self._contradicts
-        agrees = moved and len(matched) >= _MIN_AGREEING and share >= _AGREES
+        agrees = (
+            moved
+            and len(matched) >= _CONTRADICTION.min_agreeing
+            and share >= _CONTRADICTION.agreeing_share
+        )
         self._untested = 0 if tested or agrees else self._untested + 1
         self._agreeing = self._agreeing + 1 if agrees else 0
         self._count += not agrees
-        if self._agreeing >= _FRAMES or self._untested >= _BLIND_FRAMES:
+        if self._agreeing >= _CONTRADICTION.frames or self._untested >= _CONTRADICTION.blind_frames:
             self._end(
                 f"frame {index}: the right images agree with the left ones again, and are used",
                 index,
             )
-        elif self._count >= _FRAMES:
+        elif self._count >= _CONTRADICTION.frames:
             self._report(index)
         return not self._contradicts
 

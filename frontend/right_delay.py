@@ -13,6 +13,7 @@ takes the place of the one that came with it: they were paired wrongly.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,20 +26,37 @@ from vio.geometry.stereo import StereoCamera, depth_of, left_rays
 from vio.numerics.compiled import solve_positive
 from vio.records import Image
 
-_MEMORY = 0.97  # per frame, of the normal equations
-_MIN_MATCHES = 30  # in a frame that is learned from
-_MIN_FRAMES = 10  # before a delay is believed
-_MIN_DELAY = 0.25  # frames; less does little harm, and small errors of the rows look like it
-_EXPLAINS = 0.5  # share of the rows' scatter about the constant field that the delay must explain
-# standard deviations of the delay: errors of a feature's rows last for as long as the feature
-_SIGMAS = 10.0
-_ROW_SIGMA_PX = 0.5  # of the rows, beyond which a match counts less (Cauchy)
-# a delay this near to whole frames is one of whole frames: an image was paired with the wrong one
-_WHOLE = 0.15
-_FORGET = 0.1  # delay below which the images are taken to be simultaneous again
-_SUSPECT_SHARE = 0.4  # least share of features that match in another pairing …
-_CLEARLY = 1.5  # … over those that match in this one
-_SUSPECT_FRAMES = 2  # in a row
+
+class _DelayRules(NamedTuple):
+    """When the right camera exposes late."""
+
+    memory: float = 0.97  # per frame, of the normal equations
+    min_matches: int = 30  # in a frame that is learned from
+    min_frames: int = 10  # before a delay is believed
+    # frames; less does little harm, and small errors of the rows look like it
+    min_delay_frames: float = 0.25
+    # share of the rows' scatter about the constant field that the delay must explain
+    explained_share: float = 0.5
+    # standard deviations of the delay: errors of a feature's rows last for as long as the feature
+    min_sigmas: float = 10.0
+    row_sigma_px: float = 0.5  # of the rows, beyond which a match counts less (Cauchy)
+    # a delay this near to whole frames is one of whole frames: an image was paired with the wrong one
+    whole_slack_frames: float = 0.15
+    forget_frames: float = 0.1  # delay below which the images are taken to be simultaneous again
+
+
+_DELAY = _DelayRules()
+
+
+class _OtherPairing(NamedTuple):
+    """When right images belong to another frame."""
+
+    min_share: float = 0.4  # least share of features that match in another pairing …
+    clear_factor: float = 1.5  # … over those that match in this one
+    frames: int = 2  # in a row
+
+
+_OTHER = _OtherPairing()
 _TERMS = 6
 
 
@@ -97,20 +115,20 @@ class RightDelay(Finder):
             rows: right rows minus left rows (N,), pixels, as measured.
             frame_s: time since the last frame.
         """
-        if len(left) < _MIN_MATCHES:
+        if len(left) < _DELAY.min_matches:
             return False
         camera = self._camera
         x = (left[:, 0] - camera.cu) / camera.fu
         y = (left[:, 1] - camera.cv) / camera.fv
         terms = np.array([np.ones(len(x)), x, y, x * y, x * x, y * y, flow[:, 1]]).T.copy()
-        self._normal = _MEMORY * self._normal
-        self._moment = _MEMORY * self._moment
-        sigma = _ROW_SIGMA_PX if self._frames else np.inf
+        self._normal = _DELAY.memory * self._normal
+        self._moment = _DELAY.memory * self._moment
+        sigma = _DELAY.row_sigma_px if self._frames else np.inf
         count, square = add_equations(
             terms, rows, self._solution, sigma, self._normal, self._moment
         )
-        self._square = _MEMORY * self._square + square
-        self._count = _MEMORY * self._count + count
+        self._square = _DELAY.memory * self._square + square
+        self._count = _DELAY.memory * self._count + count
         self._frames += 1
         self._solution = self._moment.copy()
         solve_positive(self._normal + 1e-6 * np.eye(_TERMS + 1), self._solution)
@@ -120,20 +138,20 @@ class RightDelay(Finder):
 
     def _decide(self, index: int, frame_s: float) -> None:
         """Take a delay out where it is significant, and report it once."""
-        small = abs(self._solution[_TERMS]) <= _MIN_DELAY
-        if self._frames < _MIN_FRAMES or (self.frames == 0.0 and small):
+        small = abs(self._solution[_TERMS]) <= _DELAY.min_delay_frames
+        if self._frames < _DELAY.min_frames or (self.frames == 0.0 and small):
             return
         delay, sigma, explained = self._significance()
-        if _SIGMAS * sigma > _MIN_DELAY:
+        if _DELAY.min_sigmas * sigma > _DELAY.min_delay_frames:
             return
         whole = float(np.rint(delay))
-        rounded = whole if abs(delay - whole) < _WHOLE else delay
+        rounded = whole if abs(delay - whole) < _DELAY.whole_slack_frames else delay
         if self.frames != 0.0:
-            if abs(delay) < _FORGET:
+            if abs(delay) < _DELAY.forget_frames:
                 self._end(index)
             elif rounded != 0.0:
                 self.frames = rounded
-        elif abs(delay) > _MIN_DELAY and explained > _EXPLAINS:
+        elif abs(delay) > _DELAY.min_delay_frames and explained > _DELAY.explained_share:
             self._begin(index, rounded, delay, frame_s)
 
     def suspect(self, index: int, counts: PairingCounts, frame_s: float) -> bool:
@@ -149,15 +167,19 @@ class RightDelay(Finder):
             Whether a delay has just begun: two frames in a row say the same.
         """
         best = max(counts.late, counts.early)
-        clear = best >= _SUSPECT_SHARE * counts.points and best >= _CLEARLY * counts.same
-        clear &= counts.points >= _MIN_MATCHES and best >= _CLEARLY * min(counts.late, counts.early)
+        clear = (
+            best >= _OTHER.min_share * counts.points and best >= _OTHER.clear_factor * counts.same
+        )
+        clear &= counts.points >= _DELAY.min_matches and best >= _OTHER.clear_factor * min(
+            counts.late, counts.early
+        )
         delay = 1.0 if counts.late == best else -1.0
         self._suspected = (
             (delay, self._suspected[1] + 1 if self._suspected[0] == delay else 1)
             if clear
             else (0.0, 0)
         )
-        if self._suspected[1] < _SUSPECT_FRAMES or self.frames != 0.0:
+        if self._suspected[1] < _OTHER.frames or self.frames != 0.0:
             return False
         self._forget()
         self._begin(index, delay, delay, frame_s)

@@ -13,28 +13,45 @@ says how much less the disparities of a frame are known than those of as many fe
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
 from vio.findings import Finder, Finding
 
-_FRAMES = 6  # in a row whose offsets agree: cameras that expose apart in a turn ramp up
-_AGREE = 0.05  # of their mean: largest deviation
-_MIN_OFFSET_PX = 0.3  # an offset that is smaller is that of noise
-_JUMP_PX = 0.5  # of all disparities since the frame before …
-# … and an angle: a drive whose calibration is off has 0.55 px, 0.044 degrees
-_JUMP_RAD = 0.07 * np.pi / 180.0
-_RECENT = 20  # frames, of which so many are off where a pair shakes
-_SHAKING = 5
+
+class _TurnRules(NamedTuple):
+    """When the right camera has turned."""
+
+    frames: int = 6  # in a row whose offsets agree: cameras that expose apart in a turn ramp up
+    alike_share: float = 0.05  # of their mean: largest deviation
+    min_offset_px: float = 0.3  # an offset that is smaller is that of noise
+    jump_px: float = 0.5  # of all disparities since the frame before …
+    # … and an angle: a drive whose calibration is off has 0.55 px, 0.044 degrees
+    jump_rad: float = 0.07 * np.pi / 180.0
+    pixel_sigma_px: float = 0.3  # of one disparity, pixels
+
+
+_TURN = _TurnRules()
+
+
+class _ShakeRules(NamedTuple):
+    """When a pair shakes."""
+
+    recent_frames: int = 20  # frames, of which so many are off where a pair shakes
+    shaking_frames: int = 5
+    min_frames: int = 8  # whose common errors are known, before a pair is said to shake
+    min_px: float = 0.12  # standard deviation of the common error …
+    # … and of the angle: a drive whose calibration is off comes to 0.15 px, 0.012 degrees
+    min_rad: float = 0.02 * np.pi / 180.0
+    # of the common errors, whose largest measures their size: events are in fewer frames
+    measured_share: float = 0.8
+
+
+_SHAKE = _ShakeRules()
 _CODE = "right-camera-turned"
 _SHAKE_CODE = "right-camera-shakes"
-_MIN_FRAMES = 8  # whose common errors are known, before a pair is said to shake
-_SHAKES_PX = 0.12  # standard deviation of the common error …
-# … and of the angle: a drive whose calibration is off comes to 0.15 px, 0.012 degrees
-_SHAKES_RAD = 0.02 * np.pi / 180.0
-_SHARE = 0.8  # of the common errors, whose largest measures their size: events are in fewer frames
 _SHARE_SIGMAS = 1.2816  # of a normal distribution
-_PIXEL_SIGMA = 0.3  # of one disparity, pixels
 
 
 class RightTurn(Finder):
@@ -44,7 +61,7 @@ class RightTurn(Finder):
         super().__init__()
         self._focal_px = focal_px
         self._turn_px = 0.0  # that stays, and is taken out
-        self._were_off = deque[bool](maxlen=_RECENT)
+        self._were_off = deque[bool](maxlen=_SHAKE.recent_frames)
         self._offsets: list[float] = []  # of the last frames in a row that were off, pixels
 
     @property
@@ -54,13 +71,13 @@ class RightTurn(Finder):
 
     @property
     def _shakes(self) -> bool:
-        return sum(self._were_off) >= _SHAKING
+        return sum(self._were_off) >= _SHAKE.shaking_frames
 
     def is_jump(self, common_px: float | None) -> bool:
         """Whether the disparities of a frame differ from those of the frame before by more than
         noise.
         """
-        limit_px = max(_JUMP_PX, self._focal_px * _JUMP_RAD)
+        limit_px = max(_TURN.jump_px, self._focal_px * _TURN.jump_rad)
         return common_px is not None and abs(common_px) > limit_px
 
     def is_offset(self, offset_px: float | None) -> bool:
@@ -68,7 +85,7 @@ class RightTurn(Finder):
         return offset_px is not None and (self._is_off(offset_px) or self._shakes)
 
     def _is_off(self, offset_px: float) -> bool:
-        return abs(offset_px - self._turn_px) > _MIN_OFFSET_PX
+        return abs(offset_px - self._turn_px) > _TURN.min_offset_px
 
     def frame(self, index: int, offset_px: float | None) -> float | None:
         """Take by how much the disparities of a frame are off, against those of the pair as it was.
@@ -83,10 +100,12 @@ class RightTurn(Finder):
         if offset_px is None or not off:
             self._offsets = []
             return None
-        self._offsets = [*self._offsets, offset_px][-_FRAMES:]
+        self._offsets = [*self._offsets, offset_px][-_TURN.frames :]
         offsets = np.array(self._offsets)
         stays = float(offsets.mean())
-        if len(offsets) < _FRAMES or np.abs(offsets - stays).max() > _AGREE * abs(stays):
+        if len(offsets) < _TURN.frames or np.abs(offsets - stays).max() > _TURN.alike_share * abs(
+            stays
+        ):
             return None
         self._turn_px = stays
         self._offsets = []
@@ -94,11 +113,13 @@ class RightTurn(Finder):
         turned_deg = float(np.degrees(np.arctan(stays / self._focal_px)))
         message = (
             f"frame {index}: the right camera has turned by {abs(turned_deg):.2g} degrees about the "
-            f"vertical: since frame {index - _FRAMES + 1} all disparities are off by {stays:.2g} px; "
+            f"vertical: since frame {index - _TURN.frames + 1} all disparities are off by {stays:.2g} px; "
             "that is taken out; fix its mount, and calibrate anew"
         )
         figures = {"turned_deg": turned_deg, "offset_px": stays}
-        self._found.append(Finding(_CODE, message, index, index - _FRAMES + 1, figures=figures))
+        self._found.append(
+            Finding(_CODE, message, index, index - _TURN.frames + 1, figures=figures)
+        )
         return stays
 
 
@@ -107,8 +128,8 @@ class PairShake(Finder):
 
     def __init__(self, focal_px: float) -> None:
         super().__init__()
-        self._limit_px = max(_SHAKES_PX, focal_px * _SHAKES_RAD)
-        self._common_px = deque[float](maxlen=_RECENT)
+        self._limit_px = max(_SHAKE.min_px, focal_px * _SHAKE.min_rad)
+        self._common_px = deque[float](maxlen=_SHAKE.recent_frames)
         self._matched = 0
         self._reported = False
         # standard deviation of the common error of a frame's disparities, pixels
@@ -122,7 +143,7 @@ class PairShake(Finder):
         sigma_px = self.sigma_px
         if sigma_px <= self._limit_px:
             return 1.0
-        return float(np.sqrt(1.0 + self._matched * (sigma_px / _PIXEL_SIGMA) ** 2))
+        return float(np.sqrt(1.0 + self._matched * (sigma_px / _TURN.pixel_sigma_px) ** 2))
 
     def frame(self, index: int, common_px: float | None, matched: int) -> None:
         """Take by how much the disparities of a frame's matches differ from those of the frame
@@ -165,8 +186,8 @@ class PairShake(Finder):
         """Size of the common errors. A frame's is the difference of two: its depths are those of
         the frame before.
         """
-        if len(self._common_px) < _MIN_FRAMES:
+        if len(self._common_px) < _SHAKE.min_frames:
             return 0.0
         sizes = np.sort(np.abs(self._common_px))
-        largest = float(sizes[round(_SHARE * (len(sizes) - 1))])
+        largest = float(sizes[round(_SHAKE.measured_share * (len(sizes) - 1))])
         return largest / (_SHARE_SIGMAS * float(np.sqrt(2.0)))

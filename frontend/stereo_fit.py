@@ -62,12 +62,20 @@ class _StereoRules(NamedTuple):
 
 _STEREO = _StereoRules()
 _MAX_ROW_DIFFERENCE_PX = 1.0  # of a match, after the estimated row differences are subtracted
-_MIN_POINTS = 20
-# the third of three like angles over the root mean square of two, at most, at 99 %
-_THIRD_ANGLE = 7.0
-# A pair turns so much in its mount, three times the prior of its calibration, or exposes so far
-# apart.
-_MAX_TURN_RAD = 0.3 * np.pi / 180.0
+
+
+class _RowRules(NamedTuple):
+    """When rows are off by a turn of the right camera."""
+
+    min_points: int = 20
+    # the third of three like angles over the root mean square of two, at most, at 99 %
+    max_third_angle: float = 7.0
+    # A pair turns so much in its mount, three times the prior of its calibration, or exposes so far
+    # apart.
+    max_turn_rad: float = 0.3 * np.pi / 180.0
+
+
+_ROWS = _RowRules()
 
 
 class StereoFit:
@@ -119,7 +127,7 @@ class StereoFit:
         if moved:
             valid &= np.abs(off) <= INLIER_PX
         self.common_px = None
-        if moved and valid.sum() >= _MIN_POINTS:
+        if moved and valid.sum() >= _ROWS.min_points:
             self.common_px = median(off[valid])
         return self._with_right_pixels(tracks, rows, pixels, skew, valid)
 
@@ -152,14 +160,14 @@ class StereoFit:
         skew = skew[valid]
         off = tracks.left[rows, 0] - pixels[:, 0] - expected
         grows = self._offset_growth(tracks.left[rows])
-        if len(off) < _MIN_POINTS:
+        if len(off) < _ROWS.min_points:
             return tracks
         offset, slope = (
             common_offset(expected / grows, off / grows)
             if by_motion
             else (median(off / grows), 0.0)
         )
-        if abs(offset - self._turn_px) > self._camera.fu * _MAX_TURN_RAD:
+        if abs(offset - self._turn_px) > self._camera.fu * _ROWS.max_turn_rad:
             return tracks
         tolerance = INLIER_PX + (_STEREO.depth_slack * expected if by_motion else 0.0)
         agree = np.abs(off - offset * grows - slope * expected) <= tolerance
@@ -276,7 +284,7 @@ class StereoFit:
             for rows in tried
         ]
         best = int(np.argmax(counts))
-        if counts[best] < max(_MIN_POINTS, 2 * counts[offset + _STEREO.max_rows_half]):
+        if counts[best] < max(_ROWS.min_points, 2 * counts[offset + _STEREO.max_rows_half]):
             return offset
         self._rows.restart(2.0 * tried[best])
         return tried[best]
@@ -331,7 +339,7 @@ class StereoFit:
         """
         if not self.rows_are_off:
             return 0.0
-        return _THIRD_ANGLE * self._rows.rms_px + self._rows.disparity_px(self._camera.fu)
+        return _ROWS.max_third_angle * self._rows.rms_px + self._rows.disparity_px(self._camera.fu)
 
     def row_differences(self, left: FloatArray) -> FloatArray:
         """Right minus left rows (N,) that are expected at left pixels (N, 2)."""
@@ -343,7 +351,7 @@ class StereoFit:
 
     def update_rows(self, tracks: Tracks) -> None:
         """Update the row differences with the matches of a frame."""
-        few = len(tracks) >= _MIN_POINTS and share_of(tracks.has_right) < _STEREO.few_matches
+        few = len(tracks) >= _ROWS.min_points and share_of(tracks.has_right) < _STEREO.few_matches
         self._unmatched = self._unmatched + 1 if few else 0
         self._rows.update(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
         self._reach_wait = max(0, self._reach_wait - 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -34,10 +34,17 @@ Orientations: TypeAlias = Literal["stated", "w first, assumed", "w last, assumed
 MotionSource: TypeAlias = Literal["imu", "velocity"]
 RunMotion: TypeAlias = Literal["imu", "velocity", "none"]  # none: images alone
 
-# Rigs are calibrated to 1 % of a focal length, and gyros to 1 or 2 % of their scale.
-_RATES_DIFFER = 0.03
-_RATES_SIGMAS = 5.0
-_RATES_SIGMA = 0.01
+
+class _RotationRules(NamedTuple):
+    """When gyro and camera rotate at different rates."""
+
+    # Rigs are calibrated to 1 % of a focal length, and gyros to 1 or 2 % of their scale.
+    min_difference: float = 0.03
+    min_sigmas: float = 5.0
+    calibration_sigma: float = 0.01
+
+
+_ROTATION = _RotationRules()
 _KNOWN = 1e-8  # a standard deviation below it is rounding
 _INT64 = np.dtype(np.int64)
 _FLOAT64 = np.dtype(np.float64)
@@ -435,15 +442,16 @@ class RotationComparison:
     @property
     def differ(self) -> bool:
         """Whether they differ beyond doubt, and beyond what calibrations leave."""
-        return self.sigma < _RATES_SIGMA and abs(self.excess) > max(
-            _RATES_DIFFER, _RATES_SIGMAS * self.sigma
+        return self.sigma < _ROTATION.calibration_sigma and abs(self.excess) > max(
+            _ROTATION.min_difference, _ROTATION.min_sigmas * self.sigma
         )
 
     @property
     def agree(self) -> bool:
         """Whether no focal length that is off shows in them, be it that there are none."""
         return self.sigma == np.inf or (
-            self.sigma < 2 * _RATES_SIGMA and abs(self.excess) < _RATES_DIFFER
+            self.sigma < 2 * _ROTATION.calibration_sigma
+            and abs(self.excess) < _ROTATION.min_difference
         )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from tests.replaced_rules import replaced
 from tests.true_world import TrueWorld
 from vio.filters import imu_start, navigation
 from vio.filters.frame_update import FrameUpdate
@@ -529,7 +530,10 @@ def test_landmarks_are_gated_with_the_variance_that_they_entered_with(
     Of white noise 1 % is refused, at most.
     """
     monkeypatch.setattr("vio.filters.overdispersion.PRIOR_FACTOR", factor)
-    monkeypatch.setattr("vio.filters.overdispersion._PRIOR_TRACKS", 1e9)
+    monkeypatch.setattr(
+        "vio.filters.overdispersion._CLUSTERS",
+        replaced("vio.filters.overdispersion._CLUSTERS", prior_tracks=1e9),
+    )
     course = Course(20, 3.0, (0.4, 0.5, 0.0), yaw_rate=0.2, depth=(2.0, 8.0), features=40)
     refused = offered = 0
     for seed in range(4):

@@ -350,8 +350,8 @@ def test_terms_that_are_known_are_no_error_and_scales_alone_no_misalignment(
     """
     off = _fly(Shaking(20), OFF, np.zeros(15))
     with monkeypatch.context() as patch:
-        patch.setattr(imu_terms, "_SCALE_SIGMA", 0.0)
-        patch.setattr(imu_terms, "_MISALIGNMENT_SIGMA_DEG", 0.0)
+        patch.setattr(imu_terms, "_PRIORS", imu_terms._PRIORS._replace(scale_sigma=0.0))
+        patch.setattr(imu_terms, "_PRIORS", imu_terms._PRIORS._replace(misalignment_sigma_deg=0.0))
         on = _fly(Shaking(20), FULL, np.zeros(15))
     np.testing.assert_allclose(
         on.estimates[-1].T_world_imu, off.estimates[-1].T_world_imu, atol=1e-6

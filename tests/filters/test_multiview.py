@@ -9,6 +9,7 @@ import pytest
 
 from tests.jacobians import numeric_jacobian
 from tests.numpy_twins import inverse_depth, moved, point_D_pose
+from tests.replaced_rules import replaced
 from vio.filters.multiview import (
     CAUCHY,
     first_points,
@@ -79,7 +80,9 @@ def test_a_view_is_believed_less_the_worse_it_fits_beside_the_others_of_its_clon
 
 
 def test_rays_of_left_views_meet_before_any_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vio.filters.multiview._PARALLAX_STEPS", 0)
+    monkeypatch.setattr(
+        "vio.filters.multiview._POINTS", replaced("vio.filters.multiview._POINTS", parallax_steps=0)
+    )
     p = _points(5)
     found, known = first_points(CAMERA, T_CAM0_WORLD, _left_only(_views(p)))
     assert known.all()

@@ -176,7 +176,7 @@ def test_a_contradiction_that_stays_is_taken_with_what_it_costs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A clock that is off contradicts for good: the start comes, and says how little is known."""
-    monkeypatch.setattr(mono_start, "_PATIENCE_S", 0.4)
+    monkeypatch.setattr(mono_start, "_GRAVITY", mono_start._GRAVITY._replace(patience_s=0.4))
     monkeypatch.setattr(Turning, "rate_radps", 0.45)
     flown = Flown(Turning(50, "curve"), 0)
     start, squared = flown.filter._begun, flown.rows[0, 1]
@@ -189,7 +189,7 @@ def test_a_contradiction_that_stays_is_taken_with_what_it_costs(
 def test_a_contradiction_that_costs_too_much_starts_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(mono_start, "_PATIENCE_S", 0.4)
+    monkeypatch.setattr(mono_start, "_GRAVITY", mono_start._GRAVITY._replace(patience_s=0.4))
     flown = Flown(Turning(50, "curve"), 0)
     assert flown.begun is None
     assert "the scale is known to" in str(flown.filter.initialisation.waits_for)

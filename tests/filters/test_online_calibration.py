@@ -44,12 +44,10 @@ OFF = replace(EXACT, calibrate_camera_imu="none")
 @pytest.fixture
 def no_walk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Estimate the calibration as constants."""
-    for name in (
-        "_EXTRINSIC_ROTATION_WALK_DEG",
-        "_EXTRINSIC_TRANSLATION_WALK_M",
-        "_TIME_OFFSET_WALK_S",
-    ):
-        monkeypatch.setattr(online_calibration, name, 0.0)
+    still = online_calibration._WALKS._replace(
+        extrinsic_rotation_deg=0.0, extrinsic_translation_m=0.0, time_offset_s=0.0
+    )
+    monkeypatch.setattr(online_calibration, "_WALKS", still)
 
 
 class Shaking(Flight):

@@ -29,7 +29,7 @@ def _frame(index: int, ids: list[int], seed: int = 0) -> Observations:
 @pytest.fixture(autouse=True, scope="module")
 def least_kept() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(selectors, "_MIN_KEPT", 2)
+        patch.setattr(selectors, "_SELECTION", selectors._SELECTION._replace(min_kept=2))
         yield
 
 
@@ -85,7 +85,7 @@ def test_contract(name: str, seen: list[list[int]]) -> None:
 def test_causal_visibility_prefers_the_most_observed_features(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(selectors, "_MIN_KEPT", 1)
+    monkeypatch.setattr(selectors, "_SELECTION", selectors._SELECTION._replace(min_kept=1))
     record = [_frame(0, [1, 2]), _frame(1, [2, 3]), _frame(2, [1, 2, 3, 4])]
     selector = _build("visibility", record, fraction=0.25)
     chosen = [frame.ids[selector.select(frame).chosen].tolist() for frame in record]

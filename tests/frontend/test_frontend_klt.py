@@ -170,7 +170,7 @@ def test_tracks_are_dropped_when_the_camera_stays_black() -> None:
 
 def test_ids_are_never_reused(monkeypatch: pytest.MonkeyPatch) -> None:
     """A black frame ends every track; features found afterwards are new, even in the same image."""
-    monkeypatch.setattr(contrast, "_MAX_FRAMES", 0)
+    monkeypatch.setattr(contrast, "_CONTRAST", contrast._CONTRAST._replace(max_frames=0))
     outputs = run(_with_black_frames(1))
     assert len(outputs[2].observations) == 0
     early = np.concatenate([output.observations.ids for output in outputs[:2]])
@@ -206,7 +206,7 @@ def test_features_keep_their_distance_and_fill_the_grid(outputs: list[FrontendOu
         np.fill_diagonal(gap, np.inf)
         assert gap.min() >= 0.5 * min_distance_px(480, 300, GRID)
         held = np.bincount(cell_index(left, 480, 300, shape), minlength=shape[0] * shape[1])
-        assert held.max() <= 3 * detect._CELL_FEATURES
+        assert held.max() <= 3 * detect._CORNERS.cell_features
         assert np.mean(held > 0) > 0.85
 
 
@@ -216,7 +216,7 @@ def test_features_without_right_match_stay_as_left_only_rows(
     """A part of the right image is covered; its tracks continue in the left one for a limited
     number of frames.
     """
-    monkeypatch.setattr(new_features, "_MAX_LEFT_ONLY_FRAMES", 2)
+    monkeypatch.setattr(new_features, "_NEW", new_features._NEW._replace(max_left_only_frames=2))
 
     def covered(frame: StereoFrame) -> StereoFrame:
         right = frame.right.copy()
@@ -241,7 +241,7 @@ def test_tracks_outlast_a_right_camera_that_loses_its_contrast(
     """The limit on frames without a right match is for features, not for a camera: tracks
     continue in the left one.
     """
-    monkeypatch.setattr(new_features, "_MAX_LEFT_ONLY_FRAMES", 2)
+    monkeypatch.setattr(new_features, "_NEW", new_features._NEW._replace(max_left_only_frames=2))
     gray = np.full_like(FRAMES[0].right, 128)
     outputs = run([FRAMES[0], *(replace(frame, right=gray) for frame in FRAMES[1:5])])
     seen, later = outputs[0].observations, outputs[4].observations
@@ -342,7 +342,7 @@ def test_last_motion_is_scaled_by_time(monkeypatch: pytest.MonkeyPatch) -> None:
         replace(stereo_frame(k, se3_exp(share * step)), time_ns=ms * 1_000_000)
         for k, (share, ms) in enumerate([(0.0, 0), (0.1, 10), (0.2, 20), (1.7, 170)])
     ]
-    monkeypatch.setattr(flow, "_TRUSTED_LEVELS", 0)
+    monkeypatch.setattr(flow, "_TRACKING", flow._TRACKING._replace(trusted_levels=0))
     outputs = run(frames, with_klt(pyramid_levels=0))
     assert outputs[-1].tracked > 0.7 * outputs[-2].tracked
 
@@ -415,7 +415,7 @@ def test_a_prediction_bridges_a_long_gap() -> None:
 def test_features_failing_the_forward_backward_check_are_dropped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(flow, "_MAX_FORWARD_BACKWARD_PX", 1e-4)
+    monkeypatch.setattr(flow, "_TRACKING", flow._TRACKING._replace(max_forward_backward_px=1e-4))
     assert run(FRAMES[:2])[1].tracked < 10
 
 
@@ -503,7 +503,7 @@ def test_new_features_are_output_after_probation(monkeypatch: pytest.MonkeyPatch
     """A feature with a new id was detected at least one frame earlier."""
     settings = FrontendSettings(grid=GridSettings(target_features=300))
     held = run(FRAMES, settings)
-    monkeypatch.setattr(klt, "_PROBATION_FRAMES", 0)
+    monkeypatch.setattr(klt, "_NEW", klt._NEW._replace(probation_frames=0))
     free = run(FRAMES, settings)
     late = [
         later.observations.ids[later.observations.ids > held[0].observations.ids.max()]
@@ -579,7 +579,7 @@ def test_tracks_in_the_dark_where_noise_is_low(monkeypatch: pytest.MonkeyPatch) 
     """Mean gray level 6: weak corners are usable if they exceed the noise."""
     frames = at_night(0.05, 0.5)
     outputs = run(frames)
-    monkeypatch.setattr(detect, "_MIN_GRADIENT_OVER_NOISE", 1e6)
+    monkeypatch.setattr(detect, "_CORNERS", detect._CORNERS._replace(min_gradient_over_noise=1e6))
     absolute = run(frames)
     assert max(output.matched for output in absolute) < 0.4 * GRID.target_features
     for k in range(3):
@@ -593,7 +593,7 @@ def test_tracks_in_the_dark_where_noise_is_low(monkeypatch: pytest.MonkeyPatch) 
 def test_noise_threshold_is_inactive_in_good_light(
     outputs: list[FrontendOutput], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(detect, "_MIN_GRADIENT_OVER_NOISE", 1e6)
+    monkeypatch.setattr(detect, "_CORNERS", detect._CORNERS._replace(min_gradient_over_noise=1e6))
     for a, b in zip(outputs, run(FRAMES), strict=True):
         np.testing.assert_array_equal(a.observations.z, b.observations.z)
 
@@ -728,7 +728,7 @@ def test_only_doubtful_points_are_tracked_backward(monkeypatch: pytest.MonkeyPat
 def test_corners_are_detected_in_every_other_frame_while_few_are_missing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(klt, "_SPARE_CORNERS", 0.0)
+    monkeypatch.setattr(klt, "_NEW", klt._NEW._replace(spare_corners=0.0))
     frontend = KltFrontend(CAMERA, SETTINGS)
     few, many = GRID.target_features - 10, GRID.target_features // 2
     assert [frontend._wanted_corners(active) for active in (few, few, few, many, many, few)] == [

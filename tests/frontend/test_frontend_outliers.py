@@ -282,7 +282,7 @@ def test_two_views_reject_outliers_and_keep_inliers(
 def test_known_rotation_needs_two_tracks_for_the_direction(monkeypatch: pytest.MonkeyPatch) -> None:
     """With known rotation, 12 pairs of tracks give the direction among 45 % outliers."""
     before, after, bad = two_views(T_TRUE, 5, 0.45)
-    monkeypatch.setattr(outliers, "_SAMPLES", 12)
+    monkeypatch.setattr(outliers, "_RANSAC", outliers._RANSAC._replace(samples=12))
     kept = bearing_consensus(make_problem(), before, after, np.eye(3), T_TRUE[:3, :3])
     assert kept[~bad].mean() > 0.97
     assert kept[bad].mean() < 0.1

@@ -481,9 +481,9 @@ def test_weak_corner_next_to_a_strong_one_is_dropped(monkeypatch: pytest.MonkeyP
     image[60:80, 100:120] = 75
     nothing = np.zeros((0, 2))
     wide = GridSettings(target_features=4)  # one cell is nearly half of the image
-    monkeypatch.setattr(detect, "_MIN_DISTANCE", 0.05)
+    monkeypatch.setattr(detect, "_CORNERS", detect._CORNERS._replace(min_distance_share=0.05))
     strict = detect_corners(half_image(image), nothing, 50, wide)
-    monkeypatch.setattr(detect, "_MIN_RELATIVE_GRADIENT", 0.0)
+    monkeypatch.setattr(detect, "_CORNERS", detect._CORNERS._replace(min_relative_gradient=0.0))
     loose = detect_corners(half_image(image), nothing, 50, wide)
     assert np.abs(strict - [70, 70]).max(axis=1).max() < 16
     assert np.mean(np.abs(loose - [110, 70]).max(axis=1) < 16) > 0.3
@@ -498,7 +498,9 @@ def test_no_corners_if_none_wanted_or_image_tiny() -> None:
 def test_defaults_scale_with_the_image(width: int, height: int) -> None:
     grid = GridSettings()
     rows, columns = grid_shape(width, height, grid)
-    assert rows * columns * detect._CELL_FEATURES == pytest.approx(grid.target_features, rel=0.15)
+    assert rows * columns * detect._CORNERS.cell_features == pytest.approx(
+        grid.target_features, rel=0.15
+    )
     assert 0.75 < (width / columns) / (height / rows) < 1.35
     assert min_distance_px(width, height, grid) < 0.5 * feature_spacing(width, height, grid)
     corners = np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
@@ -534,7 +536,7 @@ def test_noise_in_the_dark_gives_few_corners(monkeypatch: pytest.MonkeyPatch) ->
         half = half_image(noisy(8, sigma, 2))
         assert len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings())) <= 3
         with monkeypatch.context() as patch:
-            patch.setattr(detect, "_MIN_GRADIENT_OVER_NOISE", 1.0)
+            patch.setattr(detect, "_CORNERS", detect._CORNERS._replace(min_gradient_over_noise=1.0))
             found = len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings()))
         assert found > (30 if sigma > 1 else 3)  # control: without the threshold there are corners
 
@@ -614,8 +616,8 @@ def test_spread_evenly_equals_a_greedy_loop(monkeypatch: pytest.MonkeyPatch) -> 
         rng.uniform([0, 0], [400, 300], (120, 2)),
         rng.uniform([0, 0], [400, 300], (10, 2)),
     )
-    monkeypatch.setattr(detect, "_CELL_FEATURES", 3)
-    monkeypatch.setattr(detect, "_MIN_DISTANCE", 0.0)
+    monkeypatch.setattr(detect, "_CORNERS", detect._CORNERS._replace(cell_features=3))
+    monkeypatch.setattr(detect, "_CORNERS", detect._CORNERS._replace(min_distance_share=0.0))
     grid = GridSettings(target_features=60)
     rows = spread_evenly(points, occupied, (400, 300), grid)
     shape = grid_shape(400, 300, grid)

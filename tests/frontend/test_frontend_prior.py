@@ -182,7 +182,7 @@ def test_prior_bridges_a_gap_too_wide_for_tracking_alone(
         stamps_ns=clip.simulation.stamps_ns[::6],
     )
     apart = Clip(simulation, [replace(clip.frames[k], index=i) for i, k in enumerate((0, 6))])
-    monkeypatch.setattr(descriptors, "_SEARCH_RADIUS", 0.02)
+    monkeypatch.setattr(descriptors, "_MATCHES", descriptors._MATCHES._replace(search_share=0.02))
     settings = replace(SETTINGS, klt=replace(SETTINGS.klt, pyramid_levels=0))
     kept = []
     for with_prior in (False, True):
@@ -227,7 +227,7 @@ def test_prior_overrides_truck_of_any_size_with_enough_support(
     share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a required support of 30 %, a third of the truck's points is enough."""
-    monkeypatch.setattr(outliers, "_PRIOR_MIN_SUPPORT", 0.3)
+    monkeypatch.setattr(outliers, "_RANSAC", outliers._RANSAC._replace(prior_min_support_share=0.3))
     wall, truck = scene(200, 32, (15.0, 40.0)), scene(200, 33, (7.0, 8.0))
     still, passing = round(200 * (1 - share)), round(200 * share)
     p = np.concatenate([wall[:still], truck[:passing]])

@@ -452,7 +452,9 @@ def test_a_map_that_is_behind_holds_up_no_frame(
     from vio.mapping import session
 
     go_on, extract = threading.Event(), session.extract
-    monkeypatch.setattr(session, "_SHARED", 1.0)  # nearly every frame is a keyframe
+    monkeypatch.setattr(
+        session, "_KEYFRAMES", session._KEYFRAMES._replace(max_shared_share=1.0)
+    )  # nearly every frame is a keyframe
 
     def waits(*images: Any) -> Any:
         go_on.wait(timeout=_PATIENCE_S)
@@ -479,6 +481,6 @@ def test_a_map_that_is_behind_holds_up_no_frame(
                 live.add_stereo(event.time_ns, event.left, event.right)
         live._worker.ask(lambda: None)  # all frames are done, and no keyframe is
         assert len(results) == len(recording.frame_times_ns) > session.HANDOVER_FRAMES
-        assert sum(r.is_keyframe for r in results) == session._MAX_WAITING
+        assert sum(r.is_keyframe for r in results) == session._KEYFRAMES.max_waiting
         go_on.set()
     assert (tmp_path / "a.map").is_file()

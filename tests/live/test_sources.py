@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 import vio
+from tests.replaced_rules import replaced
 from tests.same_events import frames_of
 from vio.cameras.rig import Rig
 from vio.cli import main
@@ -529,7 +530,7 @@ def test_an_oak_gives_pairs_samples_and_calibration_in_metres(
     """Against a stand-in: no device was at hand."""
     device = _OakDevice()
     monkeypatch.setitem(sys.modules, "depthai", device)  # type: ignore[arg-type]
-    monkeypatch.setattr("vio.sources.oak._LOST_S", 0.0)
+    monkeypatch.setattr("vio.sources.oak._WAITS", replaced("vio.sources.oak._WAITS", lost_s=0.0))
     source = open_source("oak:14442C")
     events: list[SourceEvent] = []
     with pytest.raises(DataError, match="nothing for 0 s"):

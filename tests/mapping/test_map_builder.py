@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.replaced_rules import replaced
 from vio.calibration.stereo_field import DisplacementField
 from vio.errors import DataError
 from vio.geometry.lie import (
@@ -253,7 +254,10 @@ def test_covariance_after_a_gap_is_that_of_the_loop_that_ended_it(
     room_walk: Walk, first_round: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The loops agree with the odometry, so that the map is not yet optimised again."""
-    monkeypatch.setattr("vio.mapping.builder._SETTLED", np.inf)
+    monkeypatch.setattr(
+        "vio.mapping.builder._SETTLING",
+        replaced("vio.mapping.builder._SETTLING", settled_error=np.inf),
+    )
     store = MapStore(first_round, read_only=True)
     builder = MapBuilder(store, "walk", room_walk.camera, upright=False, localise=True)
     jump = np.diag(np.repeat([30.0**2, 1.0], 3))

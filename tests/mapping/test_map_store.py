@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import ROOT
+from tests.replaced_rules import replaced
 from vio.calibration.stereo_field import DisplacementField
 from vio.errors import ConfigError, DataError, VioError
 from vio.geometry.lie import se3_exp
@@ -411,7 +412,10 @@ def test_a_long_step_ends_with_a_signal_and_with_its_time(
         signal.setitimer(signal.ITIMER_REAL, 0.2)
         with pytest.raises(KeyboardInterrupt), store._errors():
             store._db.execute(f"SELECT count(*) FROM ({ENDLESS})").fetchone()
-        monkeypatch.setattr("vio.mapping.map_database._MAX_S", 0.2)
+        monkeypatch.setattr(
+            "vio.mapping.map_database._LIMITS",
+            replaced("vio.mapping.map_database._LIMITS", max_s=0.2),
+        )
         with pytest.raises(DataError, match="a step took more than"), store._errors():
             store._db.execute(f"SELECT count(*) FROM ({ENDLESS})").fetchone()
     finally:

@@ -164,7 +164,7 @@ def test_features_are_those_of_points_that_a_swaying_camera_sees() -> None:
     disparity = z_before[rows, 0] - z_before[rows, 2]
     moved = z_before[rows, 0] - z_after[later, 0]
     # the camera moves by its baseline: the left image then shows what the right one did
-    np.testing.assert_allclose(moved, disparity, atol=6 * first_use._NOISE_PX)
+    np.testing.assert_allclose(moved, disparity, atol=6 * first_use._RUN.noise_px)
 
 
 def test_a_process_compiles_a_part(tmp_path: Path) -> None:

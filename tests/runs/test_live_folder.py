@@ -15,6 +15,7 @@ import pytest
 
 import vio
 from tests.commands import refused
+from tests.replaced_rules import replaced
 from vio.cli import main
 from vio.config import Config
 from vio.datasets.rigs import load_rig
@@ -118,8 +119,12 @@ def test_an_earlier_folder_is_kept(flight: Path, tmp_path: Path) -> None:
 @pytest.fixture
 def killed(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a live run as it was after its last frame, before its end."""
-    monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", -1.0)
-    monkeypatch.setattr("vio.runs.recorder._FLUSH_S", -1.0)
+    monkeypatch.setattr(
+        "vio.runs.recorder._TIMES", replaced("vio.runs.recorder._TIMES", checkpoint_s=-1.0)
+    )
+    monkeypatch.setattr(
+        "vio.runs.recorder._TIMES", replaced("vio.runs.recorder._TIMES", flush_s=-1.0)
+    )
     folder = _folder(flight, tmp_path / "out", Config(), save_observations=True)
     with _live(flight, folder, Config()) as odometry:
         _feed(odometry, flight)

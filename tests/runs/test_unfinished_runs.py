@@ -26,6 +26,7 @@ import pytest
 
 from tests.commands import refused, wait_for
 from tests.filters.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
+from tests.replaced_rules import replaced
 from tests.runs.test_pipeline import FakeDrive
 from vio.cli import main
 from vio.config import Config
@@ -226,7 +227,9 @@ def test_a_run_with_opencv_s_features_goes_on_to_the_same_bits(name: str, tmp_pa
 def test_points_put_away_while_running_stay_in_the_map(
     flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.05)
+    monkeypatch.setattr(
+        "vio.runs.recorder._TIMES", replaced("vio.runs.recorder._TIMES", checkpoint_s=0.05)
+    )
     whole = run(open_dataset(flight_log), Config())
     grown = run(
         open_dataset(flight_log), Config(), control=RunControl(GrowingFolder(tmp_path / "run", {}))
@@ -242,7 +245,9 @@ def test_a_checkpoint_does_not_wait_for_an_imu_that_begins_late(
     """The points put away are those of one world: that of the first frame, which knows no
     gravity.
     """
-    monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.05)
+    monkeypatch.setattr(
+        "vio.runs.recorder._TIMES", replaced("vio.runs.recorder._TIMES", checkpoint_s=0.05)
+    )
     log = _flight_log(tmp_path / "late.npz", imu_from_ns=imu_from_s * 10**9)
     whole = run(open_dataset(log), Config())
     grown = run(
@@ -431,7 +436,9 @@ def test_a_disk_that_fills_keeps_what_is_written(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("vio.runs.recorder._FLUSH_S", 0.0)
+    monkeypatch.setattr(
+        "vio.runs.recorder._TIMES", replaced("vio.runs.recorder._TIMES", flush_s=0.0)
+    )
     append, room_left = Table.append, iter(range(100))
 
     def limited(self: Table, rows: Any) -> None:
@@ -568,9 +575,13 @@ def test_a_run_that_dies_after_its_checkpoint_goes_on_with_estimates_that_were_s
 
     def died() -> str | None:
         if stop.left == 50:
-            monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.0)
+            monkeypatch.setattr(
+                "vio.runs.recorder._TIMES", replaced("vio.runs.recorder._TIMES", checkpoint_s=0.0)
+            )
         if stop.left == 49:
-            monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 1e9)
+            monkeypatch.setattr(
+                "vio.runs.recorder._TIMES", replaced("vio.runs.recorder._TIMES", checkpoint_s=1e9)
+            )
         if stop() is not None:
             raise RuntimeError("died")
         return None

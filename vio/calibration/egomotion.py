@@ -4,6 +4,8 @@ motion sensor.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.calibration.findings import NotObservable
@@ -14,15 +16,22 @@ from vio.geometry.stereo import StereoCamera, triangulate
 from vio.numerics.compiled import compiled, move_by_twist, solve_positive
 from vio.records import S_PER_NS, BoolArray, FeatureTracks, IntArray
 
-_MIN_LINKS = 8  # tracks needed between two frames
-_MIN_DISPARITY_PX = 2.0
+
+class _MotionRules(NamedTuple):
+    """When tracks determine the camera's motion between two frames."""
+
+    min_links: int = 8  # tracks needed between two frames
+    min_disparity_px: float = 2.0
+    min_twists: int = 40  # frame intervals for a calibration
+    max_gap_s: float = 0.25
+
+
+_MOTION = _MotionRules()
 # robust width per iteration, decreasing to exclude outliers
 _WIDTHS_PX = (30.0, 15.0, 8.0, 4.0, 2.0, 2.0)
 _MIN_DEPTH_M = 0.5
 # relative size of a normal matrix's smallest eigenvalue below which a motion is not determined
 _DEGENERATE = 1e-9
-_MIN_TWISTS = 40  # frame intervals for a calibration
-_LARGEST_GAP_S = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +59,12 @@ def stereo_twists(
         guess: (F - 1, 6) starting twists, cam0 frame, m/s and rad/s.
     """
     earlier, later = _links(tracks)
-    p, valid = triangulate(camera, tracks.z[earlier], min_disparity_px=_MIN_DISPARITY_PX)
+    p, valid = triangulate(camera, tracks.z[earlier], min_disparity_px=_MOTION.min_disparity_px)
     p = p[valid]
     earlier = earlier[valid]
     later = later[valid]
     count = np.bincount(tracks.frames[earlier], minlength=len(times_ns))[tracks.frames[earlier]]
-    enough = count >= _MIN_LINKS
+    enough = count >= _MOTION.min_links
     p = p[enough]
     later = later[enough]
     of = tracks.frames[earlier][enough]
@@ -195,14 +204,14 @@ def camera_motion(
     """
     found = stereo_twists(camera, tracks, times_ns, np.zeros((len(times_ns) - 1, 6)))
     dt = np.diff(times_ns)[found.frames] * S_PER_NS
-    brief = dt < _LARGEST_GAP_S
+    brief = dt < _MOTION.max_gap_s
     found = CameraMotion(times_ns, found.frames[brief], found.twists[brief])
-    if len(found.frames) < _MIN_TWISTS:
+    if len(found.frames) < _MOTION.min_twists:
         gap = float(np.median(np.diff(times_ns))) * S_PER_NS if len(times_ns) > 1 else float("inf")
         return NotObservable(
             "IMU-camera calibration",
             f"only {len(found.frames)} frame intervals determine the camera's motion "
-            f"({_MIN_TWISTS} needed; frames "
+            f"({_MOTION.min_twists} needed; frames "
             f"are {gap:.3g} s apart); too few images, too far apart, or too little texture",
         )
     return found

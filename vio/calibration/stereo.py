@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -16,7 +16,16 @@ from vio.geometry.lie import FloatArray, so3_exp, so3_log
 from vio.numerics.robust import robust_sigma
 from vio.records import BoolArray, IntArray
 
-_BLOCKS = 10  # of a jackknife
+
+class _ResidualRules(NamedTuple):
+    """From how much a calibration is judged."""
+
+    blocks: int = 10  # of a jackknife
+    min_matches: int = 150
+    cells: int = 5  # across the image, a side of the grid on which residuals show a distortion
+
+
+_RESIDUALS = _ResidualRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +40,6 @@ class _FitRules:
 
 
 _FIT = _FitRules()
-_MIN_MATCHES = 150
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +55,6 @@ class _LensRules:
 
 
 _LENS = _LensRules()
-_CELLS = 5  # across the image, a side of the grid on which residuals show a distortion
 
 # R_cam1_cam0 (3, 3), unit direction (3,) from cam0 to cam1 in cam0
 _Pose: TypeAlias = tuple[FloatArray, FloatArray]
@@ -184,9 +191,9 @@ def _cells(angles: FloatArray) -> IntArray:
     """Return the cell (N,) of a grid over the image, equally filled along x and y, of angles (N,
     2) off the axis.
     """
-    limits = np.quantile(angles, np.linspace(0, 1, _CELLS + 1)[1:-1], axis=0)
+    limits = np.quantile(angles, np.linspace(0, 1, _RESIDUALS.cells + 1)[1:-1], axis=0)
     column, row = (np.searchsorted(limits[:, k], angles[:, k]) for k in range(2))
-    return column * _CELLS + row
+    return column * _RESIDUALS.cells + row
 
 
 def _structure(values: FloatArray, cells: IntArray) -> float:
@@ -235,12 +242,12 @@ def too_few(matches: RayMatches) -> NotObservable | None:
     None: there are enough.
     """
     pairs = len(np.unique(matches.pair))
-    if len(matches.pair) >= _MIN_MATCHES and pairs >= _FIT.min_pairs:
+    if len(matches.pair) >= _RESIDUALS.min_matches and pairs >= _FIT.min_pairs:
         return None
     return NotObservable(
         "left-right extrinsics",
         f"only {len(matches.pair)} consistent matches in {pairs} pairs were found "
-        f"({_MIN_MATCHES} in {_FIT.min_pairs} "
+        f"({_RESIDUALS.min_matches} in {_FIT.min_pairs} "
         "are needed); the images are too few, do not overlap, or have no texture",
     )
 
@@ -271,7 +278,7 @@ def _tangents(d: FloatArray) -> FloatArray:
 def _blocks(labels: IntArray) -> list[BoolArray]:
     """Return masks (N,) of the rows of each of up to ten blocks of labels."""
     names = np.unique(labels)
-    parts = np.array_split(names, min(_BLOCKS, len(names)))
+    parts = np.array_split(names, min(_RESIDUALS.blocks, len(names)))
     return [np.isin(labels, part) for part in parts]
 
 
@@ -302,7 +309,7 @@ def row_residuals(z: FloatArray, width: float, height: float) -> RowResiduals | 
     """Describe the row differences of matches (N, 4) `[ul vl ur vr]` in rectified pixels, over
     the image.
     """
-    if len(z) < _MIN_MATCHES:
+    if len(z) < _RESIDUALS.min_matches:
         return NotObservable("row alignment", f"only {len(z)} matches were found")
     off = z[:, 1] - z[:, 3]
     median = float(np.median(off))

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import field as dataclass_field
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,8 +58,20 @@ _BELOW = TERMS - 1  # the one of the baseline's direction
 _PRIOR = np.array(
     [*[np.radians(0.5)] * 3, *[2e-3] * 4, *[2e-3] * 2, 1e-2, 1e-2, *[2e-3] * 2, np.radians(0.5)]
 )
-_MODEL = 1e-4  # focal lengths, 0.05 px: what terms beyond those of the field leave in a coefficient
-_NO_PARAMETER = 1.0  # focal lengths: a coefficient that says nothing of the rig
+
+
+class _FieldRules(NamedTuple):
+    """What the field of a calibration says of its parameters."""
+
+    # focal lengths, 0.05 px: what terms beyond those of the field leave in a coefficient
+    model_sigma: float = 1e-4
+    unknown_sigma: float = 1.0  # focal lengths: a coefficient that says nothing of the rig
+    named_sigmas: float = 3.0  # a parameter within so many standard deviations of zero is not named
+    # a rig that leaves more of what the run saw is none of these cameras; true ones leave 0.3 px
+    max_left_px: float = 5.0
+
+
+_FIELD = _FieldRules()
 # models that hold tangential distortion, or become one that does
 # of the parameters that a lens model may hold: k1 k2, and p1 p2
 _LENS_PARAMETERS = {
@@ -70,10 +83,18 @@ _LENS_PARAMETERS = {
     "q2": ((0.0, 0.0), (0.0, 1.0)),
 }
 _GRID = (11, 9)  # points along the image's width and height at which field and rig are compared
-_STEP = 1e-6  # of numeric derivatives by the parameters, which are all of the size of radians
-_STEPS = 15  # of Gauss-Newton; the weights of the prior need most of them
+
+
+class _FitRules(NamedTuple):
+    """The numeric fit of the parameters."""
+
+    # of numeric derivatives by the parameters, which are all of the size of radians
+    step_rad: float = 1e-6
+    iterations: int = 15  # of Gauss-Newton; the weights of the prior need most of them
+
+
+_FIT = _FitRules()
 _LINEARISED = (0, 4)  # of these steps: at the given rig and near the solution
-_NAMED_SIGMAS = 3.0  # a parameter within so many standard deviations of zero is not named
 _TEXT = {
     "wx": ("right camera turned by {} deg about its horizontal axis", 180 / np.pi, ".3f"),
     "wy": ("right camera turned by {} deg about its vertical axis", 180 / np.pi, ".3f"),
@@ -183,7 +204,7 @@ class CalibratedRig:
         for name, value, variance in zip(
             PARAMETERS, values.tolist(), np.diag(covariance).tolist(), strict=True
         ):
-            if name in _TEXT and value * value > _NAMED_SIGMAS**2 * variance:
+            if name in _TEXT and value * value > _FIELD.named_sigmas**2 * variance:
                 text, scale, form = _TEXT[name]
                 out.append(text.format(f"{scale * value:+{form}} ± {scale * variance**0.5:{form}}"))
         found = {} if self.scale is None else self.scale.percent()
@@ -266,20 +287,22 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     frame = _Frame.of(given)
     measured = DisplacementField.of(frame.camera, field).coefficients
     assert field.rows_covariance is not None
-    P = _MODEL**2 * np.eye(TERMS)
+    P = _FIELD.model_sigma**2 * np.eye(TERMS)
     P[:FIELD_TERMS, :FIELD_TERMS] += field.covariance
     P[FIELD_TERMS:, FIELD_TERMS:] += field.rows_covariance
-    P[_FOURTH, _FOURTH] += _NO_PARAMETER**2
+    P[_FOURTH, _FOURTH] += _FIELD.unknown_sigma**2
     W = np.linalg.inv(P)
     free = _expressible(given)
     x = np.zeros(len(PARAMETERS))
     J = np.zeros((TERMS, len(PARAMETERS)))
     information = np.diag(1 / _PRIOR**2)
-    for round_ in range(_STEPS):
+    for round_ in range(_FIT.iterations):
         prior = np.diag(1 / (_PRIOR**2 + x**2))
         for k in np.flatnonzero(free & (round_ in _LINEARISED)):
-            step = _STEP * np.eye(len(PARAMETERS))[k]
-            J[:, k] = (frame.coefficients(x + step) - frame.coefficients(x - step)) / (2 * _STEP)
+            step = _FIT.step_rad * np.eye(len(PARAMETERS))[k]
+            J[:, k] = (frame.coefficients(x + step) - frame.coefficients(x - step)) / (
+                2 * _FIT.step_rad
+            )
         information = J.T @ W @ J + prior
         gradient = J.T @ W @ (measured - frame.coefficients(x)) - prior @ x
         x = x + np.linalg.solve(information, gradient * free)
@@ -403,10 +426,6 @@ def _bent(
     return replace(camera, model=model, coefficients=coefficients)
 
 
-# a rig that leaves more of what the run saw is none of these cameras; true ones leave 0.3 px
-_MAX_LEFT_PX = 5.0
-
-
 def estimated_rig(
     given: Rig, estimate: Estimate, camera: StereoCamera, where: str
 ) -> CalibratedRig:
@@ -423,7 +442,7 @@ def estimated_rig(
     cause: CalibrationError | None = None
     try:
         found = calibrated_rig(given, estimate)
-        if found.left_px <= _MAX_LEFT_PX:
+        if found.left_px <= _FIELD.max_left_px:
             return found
     except CalibrationError as error:  # the fit's steps led out of the possible rigs
         cause = error

@@ -5,7 +5,7 @@ rectification.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -33,11 +33,19 @@ from vio.geometry.rectify import (
 from vio.geometry.stereo import StereoCamera, one_camera
 from vio.records import Image, ImuDensities, StereoFrame
 
-_PARTS = 32  # of a pixel, in which OpenCV's remap counts
+
+class _PixelRules(NamedTuple):
+    """What pixels of a rectified pair resolve."""
+
+    parts: int = 32  # of a pixel, in which OpenCV's remap counts
+    # of a tracked feature; what the filter learns on real images is 0.1 to 0.3
+    pixel_sigma_px: float = 0.2
+
+
+_PIXELS = _PixelRules()
 # Standard deviation of a virtual disparity over that of the pixels of a track, which are those of
 # two exposures.
 _DISPARITY_SIGMAS = 2**0.5
-_PIXEL_SIGMA_PX = 0.2  # of a tracked feature; what the filter learns on real images is 0.1 to 0.3
 # maps for cv2.remap: u and v, or those of `fixed_point`
 LookUp: TypeAlias = tuple[npt.NDArray[Any], npt.NDArray[Any]]
 
@@ -158,9 +166,9 @@ def fixed_point(maps: tuple[MapArray, MapArray]) -> LookUp:
     That is whole pixels (H, W, 2) int16, and the rest (H, W) uint16 in parts of a pixel,
     `32 v + u`.
     """
-    u, v = (np.rint(m * np.float32(_PARTS)).astype(np.int32) for m in maps)
-    whole = np.stack([u // _PARTS, v // _PARTS], axis=-1).astype(np.int16)
-    return whole, (v % _PARTS * _PARTS + u % _PARTS).astype(np.uint16)
+    u, v = (np.rint(m * np.float32(_PIXELS.parts)).astype(np.int32) for m in maps)
+    whole = np.stack([u // _PIXELS.parts, v // _PIXELS.parts], axis=-1).astype(np.int16)
+    return whole, (v % _PIXELS.parts * _PIXELS.parts + u % _PIXELS.parts).astype(np.uint16)
 
 
 def remap(image: Image, maps: LookUp, interpolation: Interpolation) -> Image:
@@ -187,7 +195,7 @@ def with_virtual_baseline(camera: StereoCamera, depth_noise: float) -> StereoCam
         camera: undistorted.
         depth_noise: k, 1/m; 0.0012 to 0.0019 for structured light.
     """
-    baseline_m = _DISPARITY_SIGMAS * _PIXEL_SIGMA_PX / (camera.fu * depth_noise)
+    baseline_m = _DISPARITY_SIGMAS * _PIXELS.pixel_sigma_px / (camera.fu * depth_noise)
     return replace(camera, baseline_m=baseline_m, kind="rgbd")
 
 

@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tokenize import TokenError
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,8 +27,16 @@ from vio.files.text import check_increasing
 from vio.geometry.lie import FloatArray
 from vio.records import NS_PER_S, BoolArray, Event, IntArray, MotionSample, Recording, StereoFrame
 
-_GRAVITY = 9.81  # m/s^2; by what accelerations and biases move the median of a motion's readings
-_GRAVITY_OFF = 1.5
+
+class _GravityRules(NamedTuple):
+    """When readings hold gravity."""
+
+    # m/s^2; by what accelerations and biases move the median of a motion's readings
+    usual_mps2: float = 9.81
+    max_off_mps2: float = 1.5
+
+
+_GRAVITY_RULES = _GravityRules()
 # the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes
 _MAX_ARRAY_BYTES = 2**31
 # What a damaged or encrypted archive also raises: an unknown compression, a header that is no
@@ -55,7 +64,11 @@ def check_gravity_column(values: FloatArray, where: str, form: str, remedy: str)
         remedy: what to do.
     """
     first, second = (float(np.median(np.linalg.norm(values[:, k : k + 3], axis=1))) for k in (0, 3))
-    if abs(first - _GRAVITY) < _GRAVITY_OFF < abs(second - _GRAVITY):
+    if (
+        abs(first - _GRAVITY_RULES.usual_mps2)
+        < _GRAVITY_RULES.max_off_mps2
+        < abs(second - _GRAVITY_RULES.usual_mps2)
+    ):
         raise DataError(
             f"{where}: gravity is in the columns 2 to 4 (median {first:.2f}), where {form} has the "
             f"gyro; {remedy}"

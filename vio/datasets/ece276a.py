@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,10 +50,20 @@ OLD_KEYS = (
     "cam_T_imu",
 )
 NEW_KEYS = ("timestamps", "features", "v_t", "w_t", "K_l", "K_r", "extL_T_imu", "extR_T_imu")
-# allowed offset of the right camera from the left one's x axis, as a share of the baseline
-_RECTIFIED = 0.02
-_SAME_M = 1e-3  # difference below which both interpretations of the translation are the same
-_ALIGNED = 2e-3  # largest deviation from identity of the rotation between rectified cameras
+
+
+class _RigRules(NamedTuple):
+    """How the rig of a file is understood."""
+
+    # allowed offset of the right camera from the left one's x axis, as a share of the baseline
+    rectified_rad: float = 0.02
+    # difference below which both interpretations of the translation are the same
+    same_m: float = 1e-3
+    # largest deviation from identity of the rotation between rectified cameras
+    max_deviation: float = 2e-3
+
+
+_RIG = _RigRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,8 +202,8 @@ def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibrati
     for left, right in (given, [se3_inverse(T) for T in given]):
         T_cam1_cam0 = right @ se3_inverse(left)
         x, y, z = T_cam1_cam0[:3, 3]
-        aligned = np.abs(T_cam1_cam0[:3, :3] - np.eye(3)).max() < _ALIGNED
-        if aligned and x < 0 and np.hypot(y, z) < _RECTIFIED * -x:
+        aligned = np.abs(T_cam1_cam0[:3, :3] - np.eye(3)).max() < _RIG.max_deviation
+        if aligned and x < 0 and np.hypot(y, z) < _RIG.rectified_rad * -x:
             return _Calibration(_camera(K, float(-x), path), left, ambiguous=False)
     raise CalibrationError(
         f"{path}: extL_T_imu and extR_T_imu place the cameras "
@@ -216,7 +227,7 @@ def _resolve_extrinsics(
     R = literal[:3, :3]
     t = literal[:3, 3]
     corrected = se3_from_parts(R, -R @ t)
-    if np.abs(corrected - literal).max() < _SAME_M:
+    if np.abs(corrected - literal).max() < _RIG.same_m:
         return literal, ()
     if mode == "corrected":
         return corrected, ()

@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +15,17 @@ from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.records import NS_PER_S, IntArray, Recording
 
-# of an interval that a frame may come early: cameras jitter, and 30 frames/s are rarely exactly 30
-_EARLY = 0.1
+
+class _StampRules(NamedTuple):
+    """Which stamps belong together."""
+
+    # of an interval that a frame may come early: cameras jitter, and 30 frames/s are rarely exactly 30
+    early_share: float = 0.1
+    # allowed deviation of the offset between paired stamps from its median
+    jitter_ns: int = 1_000_000
+
+
+_STAMPS = _StampRules()
 
 
 class FrameRateLimit:
@@ -31,7 +41,9 @@ class FrameRateLimit:
         Args:
             most_hz: frames a second; None: no limit.
         """
-        self._least_ns = 0 if most_hz is None else round((1 - _EARLY) * NS_PER_S / most_hz)
+        self._least_ns = (
+            0 if most_hz is None else round((1 - _STAMPS.early_share) * NS_PER_S / most_hz)
+        )
         self._last_ns: int | None = None
 
     def takes(self, time_ns: int) -> bool:
@@ -102,7 +114,6 @@ def _frame(recording: Recording, bound: int | Seconds) -> int:
 
 
 PAIRED_NS = 3_000_000  # stamps further apart belong to different exposures
-_JITTER_NS = 1_000_000  # allowed deviation of the offset between paired stamps from its median
 
 
 def pair_stamps(left_ns: IntArray, right_ns: IntArray) -> tuple[IntArray, IntArray]:
@@ -116,7 +127,7 @@ def pair_stamps(left_ns: IntArray, right_ns: IntArray) -> tuple[IntArray, IntArr
     near = (np.abs(offset) < PAIRED_NS) & (nearest(right_ns, left_ns)[b] == a)
     if 2 * len(equal_a) >= near.sum():
         return equal_a.astype(np.int64), equal_b.astype(np.int64)
-    steady = near & (np.abs(offset - np.median(offset[near])) <= _JITTER_NS)
+    steady = near & (np.abs(offset - np.median(offset[near])) <= _STAMPS.jitter_ns)
     return a[steady], b[steady]
 
 

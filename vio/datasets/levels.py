@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +17,18 @@ from vio.records import Image
 
 _FULL = 65535
 _SENSOR_BITS = (10, 12, 14)  # of cameras whose pixels are stored in the low bits of 16
-_SHARE = 0.999  # of the pixels are no brighter than the level that shows the bits in use
-_MOSAIC = 1.2  # see `is_mosaic`; photographs have 0.5 to 0.8, white noise 1, mosaics 1.35 to 18
+
+
+class _LevelRules(NamedTuple):
+    """What gray levels tell of the bits in use."""
+
+    # of the pixels are no brighter than the level that shows the bits in use
+    bright_share: float = 0.999
+    # see `is_mosaic`; photographs have 0.5 to 0.8, white noise 1, mosaics 1.35 to 18
+    mosaic_ratio: float = 1.2
+
+
+_LEVELS = _LevelRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +63,8 @@ def band_of(pixels: npt.NDArray[Any]) -> Band:
     dead ones, do not count below.
     """
     seen = pixels[pixels > 0]
-    low = float(np.quantile(seen, 1 - _SHARE)) if seen.size else 0.0
-    return low, float(np.quantile(pixels, _SHARE))
+    low = float(np.quantile(seen, 1 - _LEVELS.bright_share)) if seen.size else 0.0
+    return low, float(np.quantile(pixels, _LEVELS.bright_share))
 
 
 def levels_of(bands: Iterable[Band]) -> Levels:
@@ -96,7 +106,7 @@ def is_mosaic(pixels: npt.NDArray[Any]) -> bool:
     if pixels.ndim != 2 or min(pixels.shape) < 8:
         return False
     values = pixels.astype(np.float32)
-    return all(_roughness(v) > _MOSAIC for v in (values, values.T))
+    return all(_roughness(v) > _LEVELS.mosaic_ratio for v in (values, values.T))
 
 
 def _roughness(values: npt.NDArray[np.float32]) -> float:

@@ -18,6 +18,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -69,8 +70,16 @@ _GRAY = (0, 1)  # of KITTI
 _COLOUR = (2, 3)
 _INSIDE = ("data", "images", "")
 _DRIVE_NS = 100_000_000  # between frames of a KITTI drive
-_DEEPEST = 3  # levels of folders that are looked into for images
-_MAX_FOLDERS = 200
+
+
+class _FolderRules(NamedTuple):
+    """Which folders are looked into."""
+
+    max_depth: int = 3  # levels of folders that are looked into for images
+    max_folders: int = 200
+
+
+_FOLDERS = _FolderRules()
 
 
 def is_kitti_folder(path: Path) -> bool:
@@ -174,7 +183,7 @@ def image_folders(path: Path) -> dict[Path, int]:
     found: dict[Path, int] = {}
     waiting = [(path, 0)]
     looked = 0
-    while waiting and looked < _MAX_FOLDERS:
+    while waiting and looked < _FOLDERS.max_folders:
         folder, depth = waiting.pop(0)
         looked = looked + 1
         try:
@@ -184,7 +193,7 @@ def image_folders(path: Path) -> dict[Path, int]:
         count = sum(os.path.splitext(entry.name)[1].lower() in SUFFIXES for entry in entries)
         if count and depth:
             found[folder.relative_to(path)] = count
-        if depth < _DEEPEST:
+        if depth < _FOLDERS.max_depth:
             waiting += [(Path(entry.path), depth + 1) for entry in entries if entry.is_dir()]
     return found
 

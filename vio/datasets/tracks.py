@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,12 +27,29 @@ from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, FeatureTracks, IntArray
 
 _MISSING = -1.0  # the files' code for "not seen"
-_HALF_WINDOW = 5  # frames on each side of the moving average of velocities
-_STATIONARY_MPS = 0.05  # speeds below are stationary
-_STATIONARY_RADPS = 0.1
-_SIGNIFICANCE = 4.0  # standard errors by which a mean velocity must differ from zero
-_JUMP_THRESHOLD = 1.5  # steps: below, the track switched its point (1); above, it did not (2)
-_MIN_JUMPS = 20  # rows needed to decide
+
+
+class _StationaryRules(NamedTuple):
+    """When the body stands, by its measured velocities."""
+
+    half_window_frames: int = 5  # frames on each side of the moving average of velocities
+    max_mps: float = 0.05  # speeds below are stationary
+    max_radps: float = 0.1
+    # standard errors by which a mean velocity must differ from zero
+    significance_sigmas: float = 4.0
+
+
+_STATIONARY = _StationaryRules()
+
+
+class _RepeatRules(NamedTuple):
+    """What pixels that repeat mean for a track."""
+
+    jump_steps: float = 1.5  # steps: below, the track switched its point (1); above, it did not (2)
+    min_jumps: int = 20  # rows needed to decide
+
+
+_REPEATS = _RepeatRules()
 
 
 def tracks_from_dense(features: FloatArray, path: Path) -> FeatureTracks:
@@ -84,16 +102,16 @@ def moving_frames(linear: FloatArray, angular: FloatArray) -> BoolArray:
     It moves where, on any axis, the mean over a few frames is significant and exceeds a minimum
     speed.
     """
-    return _differs_from_zero(linear, _STATIONARY_MPS) | _differs_from_zero(
-        angular, _STATIONARY_RADPS
+    return _differs_from_zero(linear, _STATIONARY.max_mps) | _differs_from_zero(
+        angular, _STATIONARY.max_radps
     )
 
 
 def _differs_from_zero(values: FloatArray, min_speed: float) -> BoolArray:
     count = len(values)
     k = np.arange(count)
-    low = np.maximum(k - _HALF_WINDOW, 0)
-    high = np.minimum(k + _HALF_WINDOW + 1, count)
+    low = np.maximum(k - _STATIONARY.half_window_frames, 0)
+    high = np.minimum(k + _STATIONARY.half_window_frames + 1, count)
     n = (high - low)[:, None]
     total, squares = (
         np.concatenate([np.zeros((1, 3)), np.cumsum(a, axis=0)]) for a in (values, values**2)
@@ -101,7 +119,9 @@ def _differs_from_zero(values: FloatArray, min_speed: float) -> BoolArray:
     mean = (total[high] - total[low]) / n
     scatter = np.maximum((squares[high] - squares[low]) / n - mean**2, 0.0)
     error = np.sqrt(scatter / n)
-    return (np.abs(mean) > np.maximum(min_speed, _SIGNIFICANCE * error)).any(axis=1)
+    return (np.abs(mean) > np.maximum(min_speed, _STATIONARY.significance_sigmas * error)).any(
+        axis=1
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +190,7 @@ def _jump(tracks: FeatureTracks, previous: IntArray, carried: BoolArray) -> floa
     before = np.linalg.norm(tracks.z[a, :2] - tracks.z[previous[a], :2], axis=1)
     after = np.linalg.norm(tracks.z[c, :2] - tracks.z[b, :2], axis=1)
     clear = before >= 1.0
-    if clear.sum() < _MIN_JUMPS:
+    if clear.sum() < _REPEATS.min_jumps:
         return None
     return float(np.median(after[clear] / before[clear]))
 
@@ -193,7 +213,7 @@ def resolve_repeats(
     if mode == "literal":
         return tracks, (f"{note}; used as they are, as requested",)
     jump = "" if found.jump is None else f" (pixels move {found.jump:.2f} steps afterwards"
-    changed = found.jump is not None and found.jump < _JUMP_THRESHOLD
+    changed = found.jump is not None and found.jump < _REPEATS.jump_steps
     if mode == "flag" or (mode == "auto" and not changed):
         return marked, (f"{note}; they are flagged{jump and jump + ')'}",)
     why = jump and jump + (", not 2: they show other points of the scene)" if changed else ")")

@@ -5,6 +5,7 @@ the other trajectory bears out.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,9 +17,16 @@ from vio.evaluation.reference_axes import with_other_order
 from vio.geometry.lie import FloatArray, nearest_rotation
 from vio.records import Trajectory
 
-_LARGE_DEG = 5.0  # of a spread, below which no order is doubted
-_BETTER = 5.0  # by which the right order must explain the attitudes better
-_FEWEST = 3
+
+class _OrderRules(NamedTuple):
+    """When the order of quaternions is doubted."""
+
+    large_deg: float = 5.0  # of a spread, below which no order is doubted
+    better_ratio: float = 5.0  # by which the right order must explain the attitudes better
+    min_poses: int = 3
+
+
+_ORDER = _OrderRules()
 
 
 def settled_orders(
@@ -43,12 +51,12 @@ def settled_orders(
     if not assumed or "none" in (estimate.orientations, reference.orientations):
         return estimate, reference, ()
     as_read = _spread_deg(estimate, reference, max_time_difference_s)
-    if as_read is None or as_read < _LARGE_DEG:
+    if as_read is None or as_read < _ORDER.large_deg:
         return estimate, reference, ()
     for name, exchanged in assumed.items():
         pair = (exchanged, reference) if name == "estimate" else (estimate, exchanged)
         spread = _spread_deg(*pair, max_time_difference_s)
-        if spread is not None and _BETTER * spread < as_read:
+        if spread is not None and _ORDER.better_ratio * spread < as_read:
             read = "first" if exchanged.orientations == "w first, assumed" else "last"
             other = "last" if read == "first" else "first"
             note = (
@@ -76,7 +84,7 @@ def _spread_deg(estimate: Trajectory, reference: Trajectory, limit_s: float) -> 
     """
     try:
         _, rows, reference_rows = associate(estimate, reference, max_time_difference_s=limit_s)
-        if len(rows) < _FEWEST:
+        if len(rows) < _ORDER.min_poses:
             return None
         T_est = estimate.T_world_body[rows]
         T_ref = reference.T_world_body[reference_rows]

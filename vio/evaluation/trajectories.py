@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass, replace
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -40,8 +40,18 @@ from vio.evaluation.reference_axes import attitude_note
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.records import BodyFrame, IntArray, Trajectory
 
-_MILLIMETRES_BELOW_M = 0.01  # lengths in words
-_SHORT_M = 10.0  # over shorter lengths a drift for 100 m says nothing that a reader can picture
+
+class _WordingRules(NamedTuple):
+    """How figures are stated."""
+
+    millimetres_below_m: float = 0.01  # lengths in words
+    # over shorter lengths a drift for 100 m says nothing that a reader can picture
+    short_m: float = 10.0
+    # of a position from the origin: farther than the sun, and squares do not overflow
+    farthest_m: float = 1e12
+
+
+_WORDING = _WordingRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +70,6 @@ class _SuspicionRules:
 
 _SUSPECT = _SuspicionRules()
 _UNITS = {"millimetres": 1000.0, "centimetres": 100.0}
-# of a position from the origin: farther than the sun, and squares do not overflow
-_FARTHEST_M = 1e12
 # Of an evaluation, as it holds them.
 _FIGURES = (
     *(
@@ -269,7 +277,9 @@ def metres_text(value_m: float) -> str:
     """Return a length with its unit: millimetres below a centimetre, else metres with three
     decimals.
     """
-    return f"{1e3 * value_m:.3g} mm" if value_m < _MILLIMETRES_BELOW_M else f"{value_m:.3f} m"
+    return (
+        f"{1e3 * value_m:.3g} mm" if value_m < _WORDING.millimetres_below_m else f"{value_m:.3f} m"
+    )
 
 
 def lengths_text(lengths_m: Sequence[float]) -> str:
@@ -283,7 +293,7 @@ def rotation_drift_text(deg_per_100m: float, lengths_m: Sequence[float], digits:
     """Return a drift of rotation with its unit: `0.039 deg/100 m`, or by the metre where no
     length has ten metres.
     """
-    if max(lengths_m) < _SHORT_M:
+    if max(lengths_m) < _WORDING.short_m:
         return f"{deg_per_100m / 100:.{digits}f} deg/m"
     return f"{deg_per_100m:.{digits}f} deg/100 m"
 
@@ -294,7 +304,7 @@ def _plain(value: Any) -> Any:
 
 
 def _require_finite(name: str, trajectory: Trajectory) -> None:
-    bad = ~(np.abs(trajectory.T_world_body.reshape(-1, 16)) < _FARTHEST_M).all(axis=1)
+    bad = ~(np.abs(trajectory.T_world_body.reshape(-1, 16)) < _WORDING.farthest_m).all(axis=1)
     if bad.any():
         raise EvaluationError(
             f"pose {int(np.argmax(bad))} of the {name} is not finite ({int(bad.sum())} of "

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, NoReturn, TypeAlias, get_args
+from typing import Literal, NamedTuple, NoReturn, TypeAlias, get_args
 
 import numpy as np
 
@@ -44,8 +44,16 @@ _MIN_COLUMNS = 4  # a stamp and a position
 _POSE_COLUMNS = 8
 _KITTI_COLUMNS = 12
 _WHOLE = re.compile(r"[+-]?\d+")
-_LARGEST = 1e12  # of a coordinate, in metres: beyond, squares overflow
-_EXACT = 1e-12  # rotations this close to orthonormal keep their bits
+
+
+class _PoseRules(NamedTuple):
+    """What a pose of a file may be."""
+
+    max_coordinate_m: float = 1e12  # of a coordinate, in metres: beyond, squares overflow
+    exact_deviation: float = 1e-12  # rotations this close to orthonormal keep their bits
+
+
+_POSES = _PoseRules()
 _COLUMNS: dict[TrajectoryFormat, str] = {
     "tum": "8 columns 'timestamp tx ty tz qx qy qz qw'",
     "kitti": "12 columns, the first three rows of a 4x4 pose",
@@ -54,8 +62,17 @@ _COLUMNS: dict[TrajectoryFormat, str] = {
 _EUROC_HEADER = (
     "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w, q_RS_x, q_RS_y, q_RS_z\n"
 )
-_LONGEST_LINE = 2**20  # bytes: the frames of a day with gaps are numbered in a comment of less
-_LONGEST_LIST = 100  # characters of frame numbers in a warning
+
+
+class _CommentRules(NamedTuple):
+    """How much of a comment is read and shown."""
+
+    # bytes: the frames of a day with gaps are numbered in a comment of less
+    max_line_bytes: int = 2**20
+    max_list_characters: int = 100  # characters of frame numbers in a warning
+
+
+_COMMENTS = _CommentRules()
 _DEFAULT_BODY: dict[TrajectoryFormat, BodyFrame] = {"tum": "imu", "kitti": "cam0", "euroc": "imu"}
 
 
@@ -255,7 +272,7 @@ def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
     frames = trajectory.frame_indices
     if frames is not None and not np.array_equal(frames, np.arange(len(trajectory))):
         text = _format_frames(frames)
-        if len(text) > _LONGEST_LIST:
+        if len(text) > _COMMENTS.max_list_characters:
             text = f"{frames[0]} to {frames[-1]} with gaps, {len(frames)} in all"
         logger.warning(
             "%s: its rows are the frames %s; tools that number rows from 0 will misread them",
@@ -297,7 +314,9 @@ def is_trajectory_file(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as stream:
-        lines = iter(lambda: stream.readline(_LONGEST_LINE).decode("utf-8", errors="replace"), "")
+        lines = iter(
+            lambda: stream.readline(_COMMENTS.max_line_bytes).decode("utf-8", errors="replace"), ""
+        )
         rows = (line for line in lines if line.strip() and line[0] not in "#%")
         first = next((line for line in rows if not _is_header(line)), "")
     fields = split_cells(first.rstrip().rstrip(",;"))
@@ -396,11 +415,11 @@ def _floats(table: _Table, columns: Sequence[int], *, finite: bool = True) -> Fl
     except ValueError as error:
         table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
     out = np.array(values).reshape(-1, len(columns))
-    bad = ~(np.abs(out) < _LARGEST).all(axis=1)
+    bad = ~(np.abs(out) < _POSES.max_coordinate_m).all(axis=1)
     if finite and bad.any():
         table.fail(
             int(np.argmax(bad)),
-            f"a pose is not finite, or beyond {_LARGEST:g} (first of {int(bad.sum())}); remove "
+            f"a pose is not finite, or beyond {_POSES.max_coordinate_m:g} (first of {int(bad.sum())}); remove "
             "such lines",
         )
     return out
@@ -421,11 +440,11 @@ def _quaternion_poses(
         q_xyzw = np.zeros_like(q_xyzw)
     known = np.any(q_xyzw != 0, axis=1)
     q_xyzw[~known] = (0.0, 0.0, 0.0, 1.0)
-    not_finite = ~(np.abs(q_xyzw) < _LARGEST).all(axis=1)
+    not_finite = ~(np.abs(q_xyzw) < _POSES.max_coordinate_m).all(axis=1)
     if not_finite.any():
         table.fail(
             int(np.argmax(not_finite)),
-            f"a pose is not finite, or beyond {_LARGEST:g} (first of {int(not_finite.sum())}); "
+            f"a pose is not finite, or beyond {_POSES.max_coordinate_m:g} (first of {int(not_finite.sum())}); "
             "remove such lines",
         )
     norm = np.linalg.norm(q_xyzw, axis=1)
@@ -455,7 +474,9 @@ def _kitti_poses(table: _Table) -> FloatArray:
             else f"is off orthonormal by {deviation[row]:.3g}"
         )
         table.fail(row, f"the rotation {why}; KITTI form has {_COLUMNS['kitti']}, row by row")
-    orthonormal = np.where((deviation <= _EXACT)[:, None, None], R, nearest_rotation(R))
+    orthonormal = np.where(
+        (deviation <= _POSES.exact_deviation)[:, None, None], R, nearest_rotation(R)
+    )
     return se3_from_parts(orthonormal, values[:, :, 3])
 
 

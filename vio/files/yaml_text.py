@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
 MAX_BYTES = 2**22  # of a configuration or calibration
-# a long list of views of a calibration; aliases of aliases make a kilobyte a billion
-_MAX_NODES = 20_000
-_MAX_DEPTH = 32  # the deepest known calibration has five levels
+
+
+class _SizeLimits(NamedTuple):
+    """How large a file may be."""
+
+    # a long list of views of a calibration; aliases of aliases make a kilobyte a billion
+    max_nodes: int = 20_000
+    max_depth: int = 32  # the deepest known calibration has five levels
+
+
+_LIMITS = _SizeLimits()
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -31,10 +39,10 @@ class _PlainLoader(yaml.SafeLoader):
         self._nodes += self._nodes_of.get(event.anchor, 0) if alias else 1
         if alias and event.anchor in self.anchors and event.anchor not in self._nodes_of:
             raise self._refused(f"the value of &{event.anchor} contains itself", event)
-        if self._nodes > _MAX_NODES:
-            raise self._refused(f"more than {_MAX_NODES} values", event)
-        if self._depth >= _MAX_DEPTH:
-            raise self._refused(f"nested deeper than {_MAX_DEPTH} levels", event)
+        if self._nodes > _LIMITS.max_nodes:
+            raise self._refused(f"more than {_LIMITS.max_nodes} values", event)
+        if self._depth >= _LIMITS.max_depth:
+            raise self._refused(f"nested deeper than {_LIMITS.max_depth} levels", event)
         self._depth += 1
         try:
             node = super().compose_node(parent, index)

@@ -13,17 +13,25 @@ unknown camera-IMU calibration, IROS (2012), for the rest.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray
 
-_ITERATIONS = 6
-_BEARING_SIGMA = 2e-3  # rad, a pixel of a usual lens; larger residuals lose weight
-_MIN_SHARED = 8  # tracks that two views share, for their rotation to be used
-_TINY = 1e-12
-_MIN_DEPTH_M = 0.1  # of a point in a weight: a nearer one is noise
+
+class _AlignmentRules(NamedTuple):
+    """The fit of gyro bias, velocity and gravity to bearings."""
+
+    iterations: int = 6
+    bearing_sigma_rad: float = 2e-3  # rad, a pixel of a usual lens; larger residuals lose weight
+    min_shared_tracks: int = 8  # tracks that two views share, for their rotation to be used
+    tiny: float = 1e-12
+    min_depth_m: float = 0.1  # of a point in a weight: a nearer one is noise
+
+
+_ALIGNMENT = _AlignmentRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,14 +78,14 @@ def gyro_bias(bearings: Bearings, motion: FreeMotion, sigma_radps: float) -> Flo
     K = len(motion.times_s)
     u = np.einsum("kij,fkj->fki", motion.R_first_body, bearings.rays)
     pairs = [(j, k) for j in range(K) for k in (j + 1, j + 2) if k < K]
-    for _ in range(_ITERATIONS):
+    for _ in range(_ALIGNMENT.iterations):
         turns = motion.phi_D_bias @ bias
         now = u + np.cross(turns, u)
         A = np.eye(3) / sigma_radps**2
         b = -bias / sigma_radps**2
         for j, k in pairs:
             shared = bearings.seen[:, j] & bearings.seen[:, k]
-            if shared.sum() >= _MIN_SHARED:
+            if shared.sum() >= _ALIGNMENT.min_shared_tracks:
                 parts = _rotation_information(
                     now[shared, j], now[shared, k], motion.phi_D_bias[[j, k]]
                 )
@@ -97,7 +105,7 @@ def _rotation_information(
     t = np.linalg.eigh(n.T @ n)[1][:, 0]
     for _ in range(2):  # once more, with the weights of the residuals
         r = n @ t
-        w = 1.0 / (1.0 + (r / _BEARING_SIGMA) ** 2) / _BEARING_SIGMA**2
+        w = 1.0 / (1.0 + (r / _ALIGNMENT.bearing_sigma_rad) ** 2) / _ALIGNMENT.bearing_sigma_rad**2
         t = np.linalg.eigh((n * w[:, None]).T @ n)[1][:, 0]
     across = np.linalg.svd(t[None])[2][1:].T  # (3, 2) directions in which t may move
     dot = np.sum(u * v, axis=1)[:, None]
@@ -107,7 +115,7 @@ def _rotation_information(
     J = np.concatenate([r_D_bias, n @ across], axis=1)
     A = (J * w[:, None]).T @ J
     b = -(J * w[:, None]).T @ (n @ t)
-    lost = A[:3, 3:] @ np.linalg.inv(A[3:, 3:] + _TINY * np.eye(2))
+    lost = A[:3, 3:] @ np.linalg.inv(A[3:, 3:] + _ALIGNMENT.tiny * np.eye(2))
     return A[:3, :3] - lost @ A[3:, :3], b[:3] - lost @ b[3:]
 
 
@@ -143,10 +151,10 @@ def align_visual_inertial(
     b = -np.einsum("fkij,fkj->fki", across, fixed[first][:, None] - fixed)
     weight = seen.astype(np.float64)
     x = np.zeros(6)
-    for _ in range(_ITERATIONS):
+    for _ in range(_ALIGNMENT.iterations):
         H_xx = np.einsum("fk,fkai,fkaj->ij", weight, A_x, A_x)
         H_xd = np.einsum("fk,fkai,fka->fi", weight, A_x, A_d)
-        H_dd = np.einsum("fk,fka,fka->f", weight, A_d, A_d) + _TINY
+        H_dd = np.einsum("fk,fka,fka->f", weight, A_d, A_d) + _ALIGNMENT.tiny
         g_x = np.einsum("fk,fkai,fka->i", weight, A_x, b)
         g_d = np.einsum("fk,fka,fka->f", weight, A_d, b)
         S = H_xx - np.einsum("fi,fj,f->ij", H_xd, H_xd, 1 / H_dd)
@@ -159,11 +167,13 @@ def align_visual_inertial(
             by_v[..., None] * x[:3] + by_g[..., None] * x[3:] + (fixed[first][:, None] - fixed)
         )
         depth = np.maximum(
-            np.linalg.norm(centres + d[:, None, None] * m[:, None], axis=2), _MIN_DEPTH_M
+            np.linalg.norm(centres + d[:, None, None] * m[:, None], axis=2), _ALIGNMENT.min_depth_m
         )
         off = np.linalg.norm(A_x @ x + A_d * d[:, None, None] - b, axis=2) / depth
-        weight = seen * (d > 0)[:, None] / depth**2 / (1 + (off / _BEARING_SIGMA) ** 2)
-        if np.count_nonzero(d > 0) < _MIN_SHARED:
+        weight = (
+            seen * (d > 0)[:, None] / depth**2 / (1 + (off / _ALIGNMENT.bearing_sigma_rad) ** 2)
+        )
+        if np.count_nonzero(d > 0) < _ALIGNMENT.min_shared_tracks:
             return None
     return VisualInertialAlignment(x[:3], x[3:])
 

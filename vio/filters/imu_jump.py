@@ -11,6 +11,7 @@ estimate both anew: equation (N15) of docs/math.md.
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,19 +22,36 @@ from vio.filters.window_tracks import VIEW_PROBABILITY, LinearTracks, chi_square
 from vio.geometry.lie import FloatArray, so3_hat
 from vio.records import BoolArray
 
-_MIN_OLD_VIEWS = 4  # of a track before the newest: what it shows has been part of the scene
-_MIN_OLD_TRACKS = 15
-_AGREEMENT = 0.8  # share of the old tracks that one rotation must explain
-_MAX_TURN_RAD = 0.2  # standard deviation of the rotation before it is fitted
-_ITERATIONS = 8  # of the robust fit
-_START_STEPS = 30  # of a filter that has begun, in which a bias that is learned looks like a jump
-# A jump comes after steps that agreed: of so many before the newest ones (which may belong to it) so
-# few are off. A gyro that is wrong all the time (its axes, clock, scale) is no gyro that jumped.
-_QUIET_STEPS = 20
-_NEWEST_STEPS = 3
-_MAX_OFF = 3
-_CHANGED_SIGMAS = 3.0  # of the bias before: less is no jump
-_LIKE = 0.5  # of the larger one: rates of two steps that differ by less are one jump
+
+class _RotationRules(NamedTuple):
+    """The rotation that old tracks show."""
+
+    min_old_views: int = 4  # of a track before the newest: what it shows has been part of the scene
+    min_old_tracks: int = 15
+    min_agreeing_share: float = 0.8  # share of the old tracks that one rotation must explain
+    prior_sigma_rad: float = 0.2  # standard deviation of the rotation before it is fitted
+    iterations: int = 8  # of the robust fit
+
+
+_ROTATION = _RotationRules()
+
+
+class _JumpRules(NamedTuple):
+    """When the gyro's bias has jumped."""
+
+    # of a filter that has begun, in which a bias that is learned looks like a jump
+    start_steps: int = 30
+    # A jump comes after steps that agreed: of so many before the newest ones (which may belong to it) so
+    # few are off. A gyro that is wrong all the time (its axes, clock, scale) is no gyro that jumped.
+    quiet_steps: int = 20
+    newest_steps: int = 3
+    max_off_steps: int = 3
+    changed_sigmas: float = 3.0  # of the bias before: less is no jump
+    # of the larger one: rates of two steps that differ by less are one jump
+    alike_share: float = 0.5
+
+
+_JUMP = _JumpRules()
 
 
 def turn_of_images(
@@ -51,7 +69,7 @@ def turn_of_images(
         T_world_imu: (4, 4) the body's pose there.
     """
     old = _is_old(predicted.at)
-    if int(old.sum()) < _MIN_OLD_TRACKS:
+    if int(old.sum()) < _ROTATION.min_old_tracks:
         return None
     p_body = T_world_imu[:3, 3]
     J = predicted.at.z_D_p[old, -1]
@@ -62,7 +80,7 @@ def turn_of_images(
     about_body[:3, 3:] = -so3_hat(p_body)
     expected = about_body @ moved @ about_body.T
     covariance = expected.copy()
-    covariance[3:, 3:] += _MAX_TURN_RAD**2 * np.eye(3)
+    covariance[3:, 3:] += _ROTATION.prior_sigma_rad**2 * np.eye(3)
     information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
     motion, P, left = _robust_fit(B, r, information, predicted.variance)
     turn: FloatArray = motion[3:]
@@ -71,7 +89,7 @@ def turn_of_images(
         return None
     pixels = np.any(J != 0.0, axis=2).sum(axis=1)
     limits = predicted.variance * chi_square_table(VIEW_PROBABILITY)[pixels]
-    if np.mean(np.sum(left**2, axis=1) < limits) <= _AGREEMENT:
+    if np.mean(np.sum(left**2, axis=1) < limits) <= _ROTATION.min_agreeing_share:
         return None
     return turn
 
@@ -102,7 +120,7 @@ class GyroJump:
 
     def __init__(self) -> None:
         self._steps = 0  # of the filter since its start
-        self._off = deque[bool](maxlen=_QUIET_STEPS + _NEWEST_STEPS)  # which were off
+        self._off = deque[bool](maxlen=_JUMP.quiet_steps + _JUMP.newest_steps)  # which were off
         self._rate: FloatArray | None = None  # (3,) that the last step was off by
         # (3,) the bias before it was doubted, and its standard deviations then; None: it is not
         self._before: tuple[FloatArray, FloatArray] | None = None
@@ -113,8 +131,8 @@ class GyroJump:
         """
         self._steps += 1
         self._off.append(off)
-        before = list(self._off)[:-_NEWEST_STEPS]
-        return self._steps > _START_STEPS and sum(before) <= _MAX_OFF
+        before = list(self._off)[: -_JUMP.newest_steps]
+        return self._steps > _JUMP.start_steps and sum(before) <= _JUMP.max_off_steps
 
     def repeats(self, rate: FloatArray) -> bool:
         """Take the rate (3,) that a step was off by; return whether the last step was off by the
@@ -125,7 +143,7 @@ class GyroJump:
         if last is None:
             return False
         size = max(float(np.linalg.norm(rate)), float(np.linalg.norm(last)))
-        return float(np.linalg.norm(rate - last)) < _LIKE * size
+        return float(np.linalg.norm(rate - last)) < _JUMP.alike_share * size
 
     def doubt(self, bias: FloatArray, sigma: FloatArray) -> None:
         """Take the bias (3,) and its standard deviations (3,) as they were before they are
@@ -146,13 +164,13 @@ class GyroJump:
         before, sigma = self._before
         self._before = None
         changed = float(np.linalg.norm(bias - before))
-        return changed if changed > _CHANGED_SIGMAS * float(np.linalg.norm(sigma)) else None
+        return changed if changed > _JUMP.changed_sigmas * float(np.linalg.norm(sigma)) else None
 
 
 def _is_old(at: Residuals) -> BoolArray:
     """Which tracks (F,) the newest clone sees, and several before it have seen."""
     seen = np.any(at.z_D_p != 0.0, axis=(2, 3))
-    old: BoolArray = seen[:, -1] & (seen[:, :-1].sum(axis=1) >= _MIN_OLD_VIEWS)
+    old: BoolArray = seen[:, -1] & (seen[:, :-1].sum(axis=1) >= _ROTATION.min_old_views)
     return old
 
 
@@ -170,7 +188,7 @@ def _robust_fit(
     A = information
     # the first scale is that of the residuals themselves, as all of them are off together
     scale = max(width, float(np.median(np.sum(r**2, axis=1))))
-    for _ in range(_ITERATIONS):
+    for _ in range(_ROTATION.iterations):
         weight = 1 / (1 + np.sum(left**2, axis=1) / scale)
         A = np.einsum("f,fki,fkj->ij", weight, B, B) / variance + information
         b = np.einsum("f,fki,fk->i", weight, B, r) / variance

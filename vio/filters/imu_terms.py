@@ -11,7 +11,7 @@ readings.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -20,14 +20,31 @@ from vio.records import IMU_ENTRIES, IntArray, imu_matrices
 
 ImuTerms = Literal["off", "scale", "full"]
 IMU_TERMS = len(IMU_ENTRIES)
-# A lever that contains the noise of its own interval biases a scale by minus the noise's share of
-# the lever's square: at rest the readings are noise, which a scale of zero would explain. This
-# share is kept below 0.2 %, a fifth of what consumer IMUs' scales are off by; without it a gyro's
-# scale moved by 0.5 % in 20 s of standstill.
-_CLEAR = 500.0
-_USUAL_S = 1.0  # over which readings are averaged: a tenth of a second of noise is a tenth of it
-_SCALE_SIGMA = 0.01  # initial standard deviation of a scale, over it
-_MISALIGNMENT_SIGMA_DEG = 0.5  # initial standard deviation of a misalignment
+
+
+class _LeverRules(NamedTuple):
+    """When readings say something of the terms."""
+
+    # A lever that contains the noise of its own interval biases a scale by minus the noise's share of
+    # the lever's square: at rest the readings are noise, which a scale of zero would explain. This
+    # share is kept below 0.2 %, a fifth of what consumer IMUs' scales are off by; without it a gyro's
+    # scale moved by 0.5 % in 20 s of standstill.
+    clear_of_noise: float = 500.0
+    # over which readings are averaged: a tenth of a second of noise is a tenth of it
+    averaged_s: float = 1.0
+
+
+_LEVER = _LeverRules()
+
+
+class _TermPriors(NamedTuple):
+    """What is known of an IMU's scale and misalignment before its readings."""
+
+    scale_sigma: float = 0.01  # initial standard deviation of a scale, over it
+    misalignment_sigma_deg: float = 0.5  # initial standard deviation of a misalignment
+
+
+_PRIORS = _TermPriors()
 _SENSOR, _ROW, _COLUMN = np.array(IMU_ENTRIES).T
 # Random walk of the terms per root second, over their initial standard deviation: by their data
 # sheets, consumer accelerometers and gyros change by 0.02 to 0.03 % a degree, so two degrees in a
@@ -43,8 +60,10 @@ CHOSEN: dict[ImuTerms, IntArray] = {
 
 def term_sigmas() -> FloatArray:
     """Return the initial standard deviations (15,) of the terms."""
-    misalignment = float(np.radians(_MISALIGNMENT_SIGMA_DEG))
-    return np.asarray(np.where(_ROW == _COLUMN, _SCALE_SIGMA, misalignment), dtype=np.float64)
+    misalignment = float(np.radians(_PRIORS.misalignment_sigma_deg))
+    return np.asarray(
+        np.where(_ROW == _COLUMN, _PRIORS.scale_sigma, misalignment), dtype=np.float64
+    )
 
 
 def calibrated(readings: FloatArray, terms: FloatArray) -> FloatArray:
@@ -83,7 +102,7 @@ def usual_reading(before: FloatArray | None, readings: FloatArray, seconds: floa
     mean: FloatArray = readings.mean(axis=0)
     if before is None:
         return mean
-    return before + (1 - np.exp(-seconds / _USUAL_S)) * (mean - before)
+    return before + (1 - np.exp(-seconds / _LEVER.averaged_s)) * (mean - before)
 
 
 def significant(
@@ -102,7 +121,7 @@ def significant(
     mean = moved.mean(axis=0)
     for part, density in ((slice(0, 3), densities[1]), (slice(3, 6), densities[0])):
         squared = float(mean[part] @ mean[part]) * seconds / density**2
-        moved[:, part] *= np.sqrt(max(1 - _CLEAR / max(squared, 1e-9), 0.0))
+        moved[:, part] *= np.sqrt(max(1 - _LEVER.clear_of_noise / max(squared, 1e-9), 0.0))
     return usual + moved
 
 

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -71,11 +72,19 @@ class _StartRules:
 
 
 _START = _StartRules()
-_TILT_SIGMA_RAD = np.radians(15.0)  # of gravity by the linear solution
+
+
+class _GravityRules(NamedTuple):
+    """What a start in motion takes of gravity, and how long it waits."""
+
+    tilt_sigma_rad: float = np.radians(15.0)  # of gravity by the linear solution
+    # from the first contradiction, after which a start is taken with a covariance that allows for it
+    patience_s: float = 5.0
+
+
+_GRAVITY = _GravityRules()
 # of a start; the filter is linear in the scale to half the square of it, 0.5 %
 MAX_SCALE_SIGMA = 0.1
-# from the first contradiction, after which a start is taken with a covariance that allows for it
-_PATIENCE_S = 5.0
 _BIASES = slice(9, DIM)  # of gyro and accelerometer, among the errors
 # On the densities of accelerometer and gyro, until the filter has learned its own: too small ones
 # cost the scale, too large ones time (docs/notes/design_decisions.md, IMU noise at the start).
@@ -197,7 +206,7 @@ class MonoStarter:
         as by a wrong clock.
         """
         self._contradicted_ns = now_ns if self._contradicted_ns is None else self._contradicted_ns
-        return now_ns - self._contradicted_ns > _PATIENCE_S * 1e9
+        return now_ns - self._contradicted_ns > _GRAVITY.patience_s * 1e9
 
     def _views(self) -> list[Observations]:
         """Some of the frames, evenly spaced, with the first and the newest."""
@@ -319,7 +328,10 @@ class MonoStarter:
         s = self._imu
         sigmas = [0.0, START_VELOCITY_SIGMA_MPS, s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2]
         P = np.diag(
-            np.concatenate([[0.0] * 3, [_TILT_SIGMA_RAD] * 2, np.repeat(sigmas, [1, 3, 3, 3])]) ** 2
+            np.concatenate(
+                [[0.0] * 3, [_GRAVITY.tilt_sigma_rad] * 2, np.repeat(sigmas, [1, 3, 3, 3])]
+            )
+            ** 2
         )
         window = Window(motion, begin, P, Calibration(self._T_cam0_imu))
         for k, view in enumerate(views):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,16 +50,32 @@ from vio.records import ImuSample, MotionSample, VelocitySample
 
 DIM = 15  # error dimensions of the navigation state
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
-# by which samples may end before an exposure and its pose is still taken from its twist
-_EXTRAPOLATE_NS = 30_000_000
-_SAMPLE_S = 0.005  # between two samples of a usual IMU, where only one has come
+
+
+class _SampleRules(NamedTuple):
+    """What stands for samples that have not come."""
+
+    # by which samples may end before an exposure and its pose is still taken from its twist
+    extrapolated_ns: int = 30_000_000
+    usual_interval_s: float = 0.005  # between two samples of a usual IMU, where only one has come
+
+
+_SAMPLES = _SampleRules()
 _NO_TERMS: FloatArray = np.zeros(IMU_TERMS)
 START_VELOCITY_SIGMA_MPS = 10.0  # initial standard deviation of the velocity
 ZERO_VELOCITY_SIGMA_MPS = 0.02  # standard deviation of the velocity in a zero-velocity measurement
 ZERO_RATE_SIGMA_RADPS = 0.01  # the same of the angular rate
 RATE_BIAS_SIGMA_RADPS = 0.02  # initial standard deviation of the bias of a measured angular rate
-_RATE_BIAS_WALK = 1.0e-4  # random walk of that bias, rad/s/sqrt(s)
-_START_RATE_SIGMA_RADPS = 1.0  # initial standard deviation of the angular rate without an IMU
+
+
+class _RatePriors(NamedTuple):
+    """What is known of the angular rate without an IMU."""
+
+    bias_walk: float = 1.0e-4  # random walk of that bias, rad/s/sqrt(s)
+    start_sigma_radps: float = 1.0  # initial standard deviation of the angular rate without an IMU
+
+
+_RATE = _RatePriors()
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,7 +412,7 @@ class ImuMotion:
         """
         # new samples come into the history here
         period_ns = self._history.period_ns() if self.samples else 0.0
-        period_s = period_ns * 1e-9 if period_ns > 0 else _SAMPLE_S
+        period_s = period_ns * 1e-9 if period_ns > 0 else _SAMPLES.usual_interval_s
         return float((factors[1] * self._imu.gyro_noise_density) ** 2 / period_s)
 
     def covered(self, time_ns: int) -> int:
@@ -403,7 +420,7 @@ class ImuMotion:
         end long before.
         """
         latest = self.samples[-1].time_ns
-        return time_ns if time_ns - latest > _EXTRAPOLATE_NS else min(time_ns, latest)
+        return time_ns if time_ns - latest > _SAMPLES.extrapolated_ns else min(time_ns, latest)
 
     def _interval(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, Hidden | None]:
         """Times relative to the start (K,) in ns, readings `[gyro, accel]` (K, 6), and what gaps
@@ -466,7 +483,7 @@ class TwistMotion:
             0.0,
             0.0,
             START_VELOCITY_SIGMA_MPS,
-            _START_RATE_SIGMA_RADPS,
+            _RATE.start_sigma_radps,
             RATE_BIAS_SIGMA_RADPS,
         ]
         return np.diag(np.repeat(sigmas, 3) ** 2)
@@ -495,7 +512,7 @@ class TwistMotion:
             part[6:12, :6] = part[:6, 6:12].T
             part[6:12, 6:12] = D * tau
         Q = Q_parts.sum(axis=0)
-        Q[12:, 12:] = np.eye(3) * (_RATE_BIAS_WALK**2 * tau)
+        Q[12:, 12:] = np.eye(3) * (_RATE.bias_walk**2 * tau)
         return Transition(replace(nav, T_world_imu=moved), Phi, Q, Q_parts)
 
     def forget_before(self, time_ns: int) -> None:

@@ -5,6 +5,7 @@ motion.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,15 +14,24 @@ from vio.filters import gate_loops as loops
 from vio.geometry.lie import FloatArray
 from vio.numerics.statistics import chi_square_cdf, chi_square_quantile
 
-# over which corrections are summed: errors that last, such as a gyro's scale, show only in the sum
-_STEPS = 10
-# share of its predicted variance that the images must have removed for a direction to count
-_INFORMED = 0.3
-_LOG_VARIANCE_SIGMA = 1.5  # initial standard deviation of the logarithm of the squared factor
-_LOG_VARIANCE_WALK = 0.15  # its random walk per sum of steps
-_SURPRISE = 0.9999  # chi-square probability beyond which a single step is an exception
-_SURPRISING = chi_square_quantile(_SURPRISE, np.arange(1, 4)).tolist()
-_MAX = 1e6
+
+class _NoiseRules(NamedTuple):
+    """How the process noise is learned from the corrections."""
+
+    # over which corrections are summed: errors that last, such as a gyro's scale, show only in the sum
+    summed_steps: int = 10
+    # share of its predicted variance that the images must have removed for a direction to count
+    informed_share: float = 0.3
+    # initial standard deviation of the logarithm of the squared factor
+    log_variance_sigma: float = 1.5
+    log_variance_walk: float = 0.15  # its random walk per sum of steps
+    # chi-square probability beyond which a single step is an exception
+    surprise_probability: float = 0.9999
+    max_factor: float = 1e6
+
+
+_NOISE = _NoiseRules()
+_SURPRISING = chi_square_quantile(_NOISE.surprise_probability, np.arange(1, 4)).tolist()
 _PARTS = slice(0, 3), slice(3, 6)  # translation, rotation
 # d E[2 F_k(e^t x) - 1] / dt at t = 0 for x ~ chi-square(k), k = 0..3
 _SENSITIVITY = (0.0, 1 / np.pi, 0.5, 2 / np.pi)
@@ -59,7 +69,9 @@ class StepErrors:
         for k, part in enumerate(_PARTS):
             test = whitened_correction(self, part)
             if test.dof and test.squared > _SURPRISING[test.dof - 1]:
-                out[k] = min((test.squared / test.dof - 1) / max(test.share, 1e-12), _MAX)
+                out[k] = min(
+                    (test.squared / test.dof - 1) / max(test.share, 1e-12), _NOISE.max_factor
+                )
         return out
 
 
@@ -83,7 +95,7 @@ def whitened_correction(step: StepErrors, part: slice) -> WhitenedCorrection:
     the images removed little say nothing about the motion model and are left out.
     """
     errors = step.correction, step.expected, step.process, step.remaining
-    found = WhitenedCorrection(*loops.whiten_correction(*errors, part.start, _INFORMED))
+    found = WhitenedCorrection(*loops.whiten_correction(*errors, part.start, _NOISE.informed_share))
     if math.isnan(found.squared):
         raise np.linalg.LinAlgError("the predicted covariance is not positive")
     return found
@@ -109,7 +121,7 @@ class MotionNoise:
         """
         self.factors: FloatArray = np.ones(2) * start  # translation, rotation
         self._bounds = smallest, largest
-        self._variance: FloatArray = np.full(2, _LOG_VARIANCE_SIGMA**2)
+        self._variance: FloatArray = np.full(2, _NOISE.log_variance_sigma**2)
         self._sum: StepErrors | None = None
         self._steps = 0
 
@@ -117,7 +129,7 @@ class MotionNoise:
         """Learn from one step."""
         self._sum = step if self._sum is None else self._sum + step
         self._steps += 1
-        if self._steps < _STEPS:
+        if self._steps < _NOISE.summed_steps:
             return
         for k, part in enumerate(_PARTS):
             self._update_factor(k, whitened_correction(self._sum, part))
@@ -125,7 +137,7 @@ class MotionNoise:
         self._steps = 0
 
     def _update_factor(self, k: int, test: WhitenedCorrection) -> None:
-        self._variance[k] += _LOG_VARIANCE_WALK**2
+        self._variance[k] += _NOISE.log_variance_walk**2
         if not test.dof:
             return
         H = _SENSITIVITY[test.dof] * test.share

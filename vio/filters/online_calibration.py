@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from dataclasses import field, replace
 from functools import lru_cache
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -39,17 +39,33 @@ from vio.records import (
 
 # squared half of a twist in its standard deviations at standstill
 _NOISE_ONLY = float(chi_square_quantile(0.999, 3))
-# Random walks of a mount that gives and of clocks that drift, each per root second.
-_EXTRINSIC_ROTATION_WALK_DEG = 2.0e-3
-_EXTRINSIC_TRANSLATION_WALK_M = 1.0e-4
-_TIME_OFFSET_WALK_S = 2.0e-6
+
+
+class _Walks(NamedTuple):
+    """Random walks of a mount that gives and of clocks that drift, each per root second."""
+
+    # Random walks of a mount that gives and of clocks that drift, each per root second.
+    extrinsic_rotation_deg: float = 2.0e-3
+    extrinsic_translation_m: float = 1.0e-4
+    time_offset_s: float = 2.0e-6
+    # random walk of the rectification error per root second, over its initial standard deviation
+    stereo_share: float = 0.02
+
+
+_WALKS = _Walks()
 MIN_FIELD_SIGMA = 5.0e-4  # the same of the other rectification terms, in focal lengths
 MAX_FIELD_SIGMA = 2.0e-3
-# at least that of what both lenses have in common, which moves no rows of far points
-_MIN_COMMON_SIGMA = 1.0e-3
-_RADIAL = 5.0  # a lens is left with more radial than tangential distortion
-# random walk of the rectification error per root second, over its initial standard deviation
-_STEREO_WALK = 0.02
+
+
+class _LensPriors(NamedTuple):
+    """What is known of the lenses' errors beside the rows."""
+
+    # at least that of what both lenses have in common, which moves no rows of far points
+    min_common_sigma: float = 1.0e-3
+    radial_factor: float = 5.0  # a lens is left with more radial than tangential distortion
+
+
+_LENSES = _LensPriors()
 
 
 def stereo_field_sigmas(sigma: float, yaw_rad: float, turn_rad: float = 0.0) -> FloatArray:
@@ -59,9 +75,9 @@ def stereo_field_sigmas(sigma: float, yaw_rad: float, turn_rad: float = 0.0) -> 
     Yaw, which moves no row, is known no better than by the turn `turn_rad` that pitch and roll
     would make of the rows.
     """
-    common = max(sigma, _MIN_COMMON_SIGMA)
+    common = max(sigma, _LENSES.min_common_sigma)
     yaw = max(yaw_rad, turn_rad)
-    return np.array([yaw, *[sigma] * 3, *[_RADIAL * common] * 2, common, common])
+    return np.array([yaw, *[sigma] * 3, *[_LENSES.radial_factor * common] * 2, common, common])
 
 
 def stereo_yaw_rad(settings: MsckfSettings) -> float:
@@ -312,7 +328,7 @@ class StereoBlock(CalibrationBlock):
 
     terms: ClassVar[slice]  # of `Calibration.stereo`
     enters = "pixels"
-    walk = _STEREO_WALK
+    walk = _WALKS.stereo_share
 
     def correct(
         self,
@@ -380,7 +396,7 @@ class _ExtrinsicsBlock(CalibrationBlock):
 
     def walks(self, settings: MsckfSettings) -> FloatArray:
         return np.repeat(
-            [_EXTRINSIC_TRANSLATION_WALK_M, np.radians(_EXTRINSIC_ROTATION_WALK_DEG)], 3
+            [_WALKS.extrinsic_translation_m, np.radians(_WALKS.extrinsic_rotation_deg)], 3
         )
 
     def correct(
@@ -424,7 +440,7 @@ class _TimeOffsetBlock(CalibrationBlock):
         return np.array([settings.time_offset_sigma_s])
 
     def walks(self, settings: MsckfSettings) -> FloatArray:
-        return np.array([_TIME_OFFSET_WALK_S])
+        return np.array([_WALKS.time_offset_s])
 
     def correct(
         self,

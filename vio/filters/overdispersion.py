@@ -13,6 +13,8 @@ does.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.filters import track_loops as loops
@@ -21,10 +23,18 @@ from vio.records import IntArray
 
 # before any track has ended: white noise has 1, front ends on real images 2 to 7
 PRIOR_FACTOR = 2.5
-_PRIOR_TRACKS = 30.0  # as many ended tracks count for it
-_MAX_FEATURES = 4096  # whose clusters are kept: far more than are seen at once
+
+
+class _ClusterRules(NamedTuple):
+    """How errors that neighbours have in common are learned."""
+
+    prior_tracks: float = 30.0  # as many ended tracks count for it
+    max_features: int = 4096  # whose clusters are kept: far more than are seen at once
+    frames: int = 10  # of those in which tracks end, in which neighbours' are one cluster
+
+
+_CLUSTERS = _ClusterRules()
 CELL_RAD = 0.2  # side of the cells of directions in which features are neighbours
-_FRAMES = 10  # of those in which tracks end, in which neighbours' are one cluster
 
 
 class Overdispersion:
@@ -58,10 +68,10 @@ class Overdispersion:
         cells = np.floor(directions / CELL_RAD).astype(np.int64).tolist()
         rows: IntArray = np.empty(len(ids), dtype=np.int64)
         if len(self._free) < len(ids):
-            self._free += range(len(self._scores), len(self._scores) + _MAX_FEATURES)
-            self._scores = np.concatenate([self._scores, np.zeros((_MAX_FEATURES, 6))])
+            self._free += range(len(self._scores), len(self._scores) + _CLUSTERS.max_features)
+            self._scores = np.concatenate([self._scores, np.zeros((_CLUSTERS.max_features, 6))])
         for k, (feature, (x, y)) in enumerate(zip(ids.tolist(), cells, strict=True)):
-            cluster = self._cluster.pop(feature, (x, y, self._calls // _FRAMES))
+            cluster = self._cluster.pop(feature, (x, y, self._calls // _CLUSTERS.frames))
             self._cluster[feature] = cluster  # a feature that began again stays in its cluster
             row = self._row.pop(cluster, None)
             rows[k] = self._row[cluster] = self._free.pop() if row is None else row
@@ -69,15 +79,15 @@ class Overdispersion:
         self._calls += 1
         self._information += information.sum(axis=0)
         self._tracks += len(ids)
-        while len(self._cluster) > _MAX_FEATURES:
+        while len(self._cluster) > _CLUSTERS.max_features:
             del self._cluster[next(iter(self._cluster))]
-        while len(self._row) > _MAX_FEATURES:
+        while len(self._row) > _CLUSTERS.max_features:
             self._free.append(row := self._row.pop(next(iter(self._row))))
             self._scores[row] = 0.0
         known = self._information > 0
         if known.any():
             ratio = float(np.mean(self._squares[known] / self._information[known]))
-            learned = (_PRIOR_TRACKS * PRIOR_FACTOR + self._tracks * ratio) / (
-                _PRIOR_TRACKS + self._tracks
+            learned = (_CLUSTERS.prior_tracks * PRIOR_FACTOR + self._tracks * ratio) / (
+                _CLUSTERS.prior_tracks + self._tracks
             )
             self.factor = max(learned, 1.0)

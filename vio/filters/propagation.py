@@ -4,6 +4,8 @@ motion.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.dataclass import dataclass
@@ -28,17 +30,25 @@ from vio.records import MotionPrior, MotionSample, MotionSource
 # Factors on the motion model's densities: at the start, at least, at most.
 IMU_FACTORS = (1.0, 1.0, 50.0)
 _TWIST_FACTORS = (1.0, 0.1, 10.0)
-# A start with a large uncertainty of the tilt is linearised far from the truth, which shows as
-# process noise.
-_FACTOR_PER_TILT_SIGMA = 1 / np.radians(8.0)
-_MAX_START_FACTOR = 5.0
+
+
+class _TiltRules(NamedTuple):
+    """How an uncertain tilt counts."""
+
+    # A start with a large uncertainty of the tilt is linearised far from the truth, which shows as
+    # process noise.
+    factor_per_tilt_sigma: float = 1 / np.radians(8.0)
+    max_start_factor: float = 5.0
+    # standard deviation of a predicted rotation beyond which its pixels start no search
+    useless_rad: float = 0.2
+
+
+_TILT = _TiltRules()
 _LINEAR_RAD = (
     # standard deviation of a rotation beyond which the errors of poses before and after it are not
     # linear
     1.0
 )
-# standard deviation of a predicted rotation beyond which its pixels start no search
-_USELESS_RAD = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,8 +235,8 @@ class Propagation:
         motion = MotionPrior(T_curr_prev, A @ expected @ A.T, measured)
         of_rotation = motion.covariance[3:, 3:]  # no eigenvalue is larger than its trace
         if (
-            of_rotation.trace() > _USELESS_RAD**2
-            and np.linalg.eigvalsh(of_rotation)[-1] > _USELESS_RAD**2
+            of_rotation.trace() > _TILT.useless_rad**2
+            and np.linalg.eigvalsh(of_rotation)[-1] > _TILT.useless_rad**2
         ):
             return None
         return T_cam0_world, motion
@@ -335,5 +345,5 @@ class Propagation:
 def first_imu_noise(P: FloatArray) -> MotionNoise:
     """The IMU's noise at a start whose navigation state has the covariance P (15, 15)."""
     tilt_sigma = float(np.sqrt(P[3:5, 3:5].diagonal().max()))
-    start = min(IMU_FACTORS[0] + _FACTOR_PER_TILT_SIGMA * tilt_sigma, _MAX_START_FACTOR)
+    start = min(IMU_FACTORS[0] + _TILT.factor_per_tilt_sigma * tilt_sigma, _TILT.max_start_factor)
     return MotionNoise(start, *IMU_FACTORS[1:])

@@ -4,7 +4,7 @@ wrong.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,12 +32,19 @@ from vio.records import (
     StereoScaleEstimate,
 )
 
-# standard deviation of its coordinates, in focal lengths, over that of the focal length
-_PRINCIPAL_POINT = 1 / 3
-# of the standard deviation of a lens term, over the root mean square of the rows' field
-_COLUMNS_BY_ROWS = 3.0
-# how much larger the rows' field must become for what was learned of the columns to be in doubt
-_ROWS_MOVED = 2.0
+
+class _RigRules(NamedTuple):
+    """What the matches tell of a rig."""
+
+    # standard deviation of its coordinates, in focal lengths, over that of the focal length
+    principal_point_share: float = 1 / 3
+    # of the standard deviation of a lens term, over the root mean square of the rows' field
+    columns_by_rows: float = 3.0
+    # how much larger the rows' field must become for what was learned of the columns to be in doubt
+    rows_moved_sigmas: float = 2.0
+
+
+_RIG = _RigRules()
 
 
 def rows_off(camera: StereoCamera, offset_px: float) -> float:
@@ -55,7 +62,9 @@ def field_sigmas(camera: StereoCamera, offset_px: float, yaw_rad: float) -> Floa
     estimate of the standard deviation of the columns' (empirical Bayes).
     """
     sigma = float(
-        np.clip(_COLUMNS_BY_ROWS * rows_off(camera, offset_px), MIN_FIELD_SIGMA, MAX_FIELD_SIGMA)
+        np.clip(
+            _RIG.columns_by_rows * rows_off(camera, offset_px), MIN_FIELD_SIGMA, MAX_FIELD_SIGMA
+        )
     )
     return stereo_field_sigmas(sigma, yaw_rad, offset_px / camera.fu)
 
@@ -65,7 +74,7 @@ def constant_sigmas(settings: MsckfSettings) -> FloatArray:
 
     The baseline's is over its length, the others are over the focal length.
     """
-    centre = _PRINCIPAL_POINT * settings.stereo_focal_sigma
+    centre = _RIG.principal_point_share * settings.stereo_focal_sigma
     return np.array([settings.stereo_baseline_sigma, settings.stereo_focal_sigma, centre, centre])
 
 
@@ -85,7 +94,7 @@ class RigCalibration:
         # (8,) before anything was seen of it
         self._field_variances = prior_variances(settings)["stereo_field"]
         # size of the rows' field that gave them, focal lengths
-        self._rows_off = MIN_FIELD_SIGMA / _COLUMNS_BY_ROWS
+        self._rows_off = MIN_FIELD_SIGMA / _RIG.columns_by_rows
         # at a calibration, by the present rows
         self._field: tuple[Calibration, StereoCorrection | None] | None = None
 
@@ -120,7 +129,7 @@ class RigCalibration:
             return
         off = rows_off(self.camera, self._rows.offset_px)
         begins = "stereo_field" not in window.state
-        if not begins and off <= _ROWS_MOVED * self._rows_off:
+        if not begins and off <= _RIG.rows_moved_sigmas * self._rows_off:
             return
         yaw_rad = stereo_yaw_rad(self.settings)
         variances = field_sigmas(self.camera, self._rows.offset_px, yaw_rad) ** 2

@@ -11,31 +11,44 @@ Reference: Friedland, Treatment of bias in recursive filtering, IEEE TAC (1969).
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.filters import pose_loops as loops
 from vio.filters.navigation import NavState
 from vio.geometry.lie import FloatArray
 
-_SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
-# More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
-_MIN = 0.04
-_SIGMAS = 5.0
-# The accelerometer's noise is in the motion that is held against the images, and there passes for
-# motion at twice the scale. It has three degrees of freedom in a frame, of which images determine a
-# part: 0.1 of information on a recording of standstill, with more where the real noise is that of
-# the settings. One is allowed for.
-_BY_NOISE = 1.0
-# A velocity's squared standard deviations beyond which its own error makes less than 3 % of what it
-# says of the scale.
-_CLEAR = 100.0
+
+class _ScaleRules(NamedTuple):
+    """When a motion sensor contradicts the scale."""
+
+    # of the logarithm; a unit that is wrong is off by more, and is found as well
+    log_sigma: float = 0.1
+    # More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
+    min_log: float = 0.04
+    min_sigmas: float = 5.0
+    # The accelerometer's noise is in the motion that is held against the images, and there passes for
+    # motion at twice the scale. It has three degrees of freedom in a frame, of which images determine a
+    # part: 0.1 of information on a recording of standstill, with more where the real noise is that of
+    # the settings. One is allowed for.
+    information_by_noise: float = 1.0
+    # A velocity's squared standard deviations beyond which its own error makes less than 3 % of what it
+    # says of the scale.
+    clear_squared_sigmas: float = 100.0
+
+
+_SCALE = _ScaleRules()
 
 
 def is_clear(velocity: FloatArray, covariance: FloatArray) -> bool:
     """Whether a velocity (3,) of a covariance (3, 3) is far enough from its noise to tell the
     scale.
     """
-    return float(velocity @ np.linalg.solve(covariance + 1e-18 * np.eye(3), velocity)) > _CLEAR
+    return (
+        float(velocity @ np.linalg.solve(covariance + 1e-18 * np.eye(3), velocity))
+        > _SCALE.clear_squared_sigmas
+    )
 
 
 def scaled_nav(nav: NavState, T_cam0_imu: FloatArray) -> FloatArray:
@@ -60,7 +73,7 @@ class ScaleTest:
         self._frames = 0  # since the start
         # at which of them the scale was contradicted without a break since; 0: it is not
         self._doubted = 0
-        self._information = _SIGMA**-2
+        self._information = _SCALE.log_sigma**-2
         self._vector = 0.0
         # whether as many frames again have contradicted it as it took to find
         self.is_confirmed = False
@@ -88,7 +101,7 @@ class ScaleTest:
         stepped by an hour, rounding may leave less than the start had, and they are passed over.
         """
         information = self._information + float(V @ W - W @ P @ W)
-        if not information >= _SIGMA**-2:
+        if not information >= _SCALE.log_sigma**-2:
             return
         self._information = information
         self._vector += float(V @ remaining)
@@ -103,4 +116,7 @@ class ScaleTest:
         noise explains.
         """
         s, sigma = self.estimate()
-        return abs(s) > max(_MIN + _BY_NOISE * self._frames / self._information, _SIGMAS * sigma)
+        return abs(s) > max(
+            _SCALE.min_log + _SCALE.information_by_noise * self._frames / self._information,
+            _SCALE.min_sigmas * sigma,
+        )

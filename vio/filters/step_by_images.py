@@ -7,17 +7,26 @@ predicted tens of metres ahead. What is found here is where the fit begins, noth
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.filters.track_records import Views
 from vio.geometry.lie import FloatArray, circledot, se3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, project, triangulate, z_D_p_cam
 
-_MIN_LINKS = 12  # features that both frames show with a depth
-_MIN_DISPARITY_PX = 2.0
+
+class _StepRules(NamedTuple):
+    """When two frames show a motion."""
+
+    min_links: int = 12  # features that both frames show with a depth
+    min_disparity_px: float = 2.0
+    near_px: float = 4.0  # features that a motion explains are off by less
+    min_share: float = 0.5  # of the features, that it must explain
+
+
+_STEP = _StepRules()
 _WIDTHS_PX = (60.0, 30.0, 15.0, 8.0, 4.0, 4.0)  # of the robust fit, one a step
-_NEAR_PX = 4.0  # features that a motion explains are off by less
-_MIN_SHARE = 0.5  # of the features, that it must explain
 
 
 def linked_points(camera: StereoCamera, views: Views) -> tuple[FloatArray, FloatArray]:
@@ -29,7 +38,7 @@ def linked_points(camera: StereoCamera, views: Views) -> tuple[FloatArray, Float
         views: of tracks (F, N, 4), the newest frame last; without the rectification error.
     """
     both = np.all(views.weight[:, -2:, :3] > 0, axis=(1, 2))
-    p, known = triangulate(camera, views.z[both, -2], min_disparity_px=_MIN_DISPARITY_PX)
+    p, known = triangulate(camera, views.z[both, -2], min_disparity_px=_STEP.min_disparity_px)
     return p[known], views.z[both, -1][known]
 
 
@@ -47,7 +56,7 @@ def step_by_images(camera: StereoCamera, p_prev: FloatArray, z: FloatArray) -> F
     for width in _WIDTHS_PX:
         moved = transform_points(T, p_prev)
         ahead = depth_of(camera, moved) > 0.0
-        if int(ahead.sum()) < _MIN_LINKS:
+        if int(ahead.sum()) < _STEP.min_links:
             return None
         r = (z[ahead] - project(camera, moved[ahead]))[:, :3]
         J = z_D_p_cam(camera, moved[ahead])[:, :3] @ circledot(moved[ahead])[:, :3]
@@ -55,7 +64,7 @@ def step_by_images(camera: StereoCamera, p_prev: FloatArray, z: FloatArray) -> F
         A = np.einsum("f,fki,fkj->ij", weight, J, J)
         b = np.einsum("f,fki,fk->i", weight, J, r)
         T = se3_exp(np.linalg.solve(A + 1e-9 * np.trace(A) * np.eye(6), b)) @ T
-    return T if explained_share(camera, T, p_prev, z) >= _MIN_SHARE else None
+    return T if explained_share(camera, T, p_prev, z) >= _STEP.min_share else None
 
 
 def explained_share(
@@ -63,7 +72,7 @@ def explained_share(
     T_curr_prev: FloatArray,
     p_prev: FloatArray,
     z: FloatArray,
-    near_px: float = _NEAR_PX,
+    near_px: float = _STEP.near_px,
 ) -> float:
     """Return the share of points (K, 3) that a motion (4, 4) brings within some pixels of theirs
     (K, 4).

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import field
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,11 +32,18 @@ from vio.geometry.stereo import StereoCamera, project
 from vio.numerics.compiled import invert_positive, solve_positive
 from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, BoolArray, IntArray, Observations
 
-_MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
-_ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
-# standard deviation of the rows' coefficients before the first frame, over the noise of a row
-_ROW_PRIOR_PX = 10.0
-_ROW_PRIOR: FloatArray = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
+
+class _RowRules(NamedTuple):
+    """How the rows of matches are learned."""
+
+    min_rows: int = 30  # matches in a frame below which its rows are not learned from
+    memory: float = 0.99  # per frame, of the rows' normal equations
+    # standard deviation of the rows' coefficients before the first frame, over the noise of a row
+    prior_px: float = 10.0
+
+
+_ROWS = _RowRules()
+_ROW_PRIOR: FloatArray = np.eye(ROW_TERMS) / _ROWS.prior_px**2
 
 
 class VerticalDisparityModel:
@@ -60,7 +68,7 @@ class VerticalDisparityModel:
     def update(self, seen: Observations) -> None:
         """Take in the rows of a frame's matches, with Cauchy weights against mismatches."""
         z = seen.z[seen.has_right]
-        if len(z) < _MIN_ROWS:
+        if len(z) < _ROWS.min_rows:
             return
         camera = self._camera
         basis, common = vertical_disparity_terms(camera, z)
@@ -69,16 +77,16 @@ class VerticalDisparityModel:
         weight = np.empty(len(z))
         loops.weigh_rows(rows - camera.fv * (basis @ self.coefficients), CAUCHY, weight)
         learned = RowEquations(self._A, self._b, self._common)
-        loops.add_rows(basis, common, rows, weight, _ROW_MEMORY, learned)
+        loops.add_rows(basis, common, rows, weight, _ROWS.memory, learned)
         solution = self._b.copy()
-        solve_positive(self._A + (1 - _ROW_MEMORY) * _ROW_PRIOR, solution)
+        solve_positive(self._A + (1 - _ROWS.memory) * _ROW_PRIOR, solution)
         self._inverse = np.empty(self._A.shape)
         invert_positive(self._A + _ROW_PRIOR, self._inverse)
         self.coefficients = solution / camera.fv
         self._matches = len(z)
         misfits, weights, squares = loops.fitted_rows(basis, rows, weight, solution)
-        self._squares = _ROW_MEMORY * self._squares + misfits
-        self._count = _ROW_MEMORY * self._count + weights
+        self._squares = _ROWS.memory * self._squares + misfits
+        self._count = _ROWS.memory * self._count + weights
         self.rms_px = math.sqrt(squares / len(z))
 
     def without_common(self, stereo: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ the time step, `m_j` a landmark.
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -33,10 +33,18 @@ from vio.records import (
     VelocitySample,
 )
 
-_MIN_DEPTH_M = 0.3
-_MAX_LANDMARK_DISTANCE_M = 150.0  # observations farther away are neither initialised nor used
-_LANDMARK_PRIOR_SIGMA_M = 1.0  # standard deviation of the isotropic prior
-_MIN_FEATURES = 3  # fewer points leave a pose undetermined, and a single wrong one would steer it
+
+class _LandmarkRules(NamedTuple):
+    """Which observations become landmarks."""
+
+    min_depth_m: float = 0.3
+    max_distance_m: float = 150.0  # observations farther away are neither initialised nor used
+    prior_sigma_m: float = 1.0  # standard deviation of the isotropic prior
+    # fewer points leave a pose undetermined, and a single wrong one would steer it
+    min_features: int = 3
+
+
+_LANDMARKS = _LandmarkRules()
 
 
 def z_D_landmark(
@@ -317,7 +325,7 @@ class Vislam(Backend):
         P = self._map.P[slots]
         residual, nis = self._innovation(z, m, P)
         accepted: BoolArray = nis <= self._gate
-        outvoted = len(z) >= _MIN_FEATURES and 2 * accepted.sum() < len(z)
+        outvoted = len(z) >= _LANDMARKS.min_features and 2 * accepted.sum() < len(z)
         if outvoted and isinstance(self._motion, DriftingTwist):
             # When most features contradict the motion model, it is the model that is wrong.
             self._state = self._motion.with_inflated_covariance(self._state, step_s)
@@ -333,7 +341,7 @@ class Vislam(Backend):
         z = z[accepted]
         slots = slots[accepted]
 
-        if self._settings.mode == "slam" and len(z) >= _MIN_FEATURES:
+        if self._settings.mode == "slam" and len(z) >= _LANDMARKS.min_features:
             self._pose_update(z, m, P)
         H_m = z_D_landmark(camera, T_cam0_imu, self._state.U, m)
         residual = z - project(camera, transform_points(T_cam0_imu @ self._state.U, m))
@@ -380,14 +388,14 @@ class Vislam(Backend):
 
     def _in_front(self, m: FloatArray) -> BoolArray:
         depth = depth_of(self._camera, transform_points(self._T_cam0_imu @ self._state.U, m))
-        return (depth > _MIN_DEPTH_M) & (depth < _MAX_LANDMARK_DISTANCE_M)
+        return (depth > _LANDMARKS.min_depth_m) & (depth < _LANDMARKS.max_distance_m)
 
     def _initialise(self, ids: IntArray, z: FloatArray) -> int:
         """Create landmarks from their first stereo observation, equation (P3); return how many."""
         s = self._settings
         p_cam, valid = triangulate(self._camera, z)
         depth = depth_of(self._camera, p_cam)
-        valid &= (depth > _MIN_DEPTH_M) & (depth < _MAX_LANDMARK_DISTANCE_M)
+        valid &= (depth > _LANDMARKS.min_depth_m) & (depth < _LANDMARKS.max_distance_m)
         ids = ids[valid]
         z = z[valid]
         p_cam = p_cam[valid]
@@ -396,6 +404,6 @@ class Vislam(Backend):
             J = T_world_cam0[:3, :3] @ p_cam_D_z(self._camera, z)
             P = s.pixel_sigma_px**2 * J @ np.swapaxes(J, -1, -2)
         else:
-            P = np.broadcast_to(_LANDMARK_PRIOR_SIGMA_M**2 * np.eye(3), (len(ids), 3, 3))
+            P = np.broadcast_to(_LANDMARKS.prior_sigma_m**2 * np.eye(3), (len(ids), 3, 3))
         self._map.add(ids, transform_points(T_world_cam0, p_cam), P)
         return len(ids)

@@ -7,7 +7,7 @@ each, with their sources.
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +21,18 @@ from vio.geometry.stereo import StereoCamera
 
 DistortionModel: TypeAlias = str  # a key of `vio.geometry.lenses.registry.LENSES`
 
-# Tolerances of a pair that is rectified up to the rounding of its calibration file: rows within
-# 0.01 px.
-_ALIGNED_RAD = 2e-5
-_ALIGNED_SHARE = 1e-4  # of the baseline
-_SAME_INTRINSICS = 1e-6
+
+class _SameRules(NamedTuple):
+    """When two cameras are taken for rectified."""
+
+    # Tolerances of a pair that is rectified up to the rounding of its calibration file: rows within
+    # 0.01 px.
+    aligned_rad: float = 2e-5
+    aligned_share: float = 1e-4  # of the baseline
+    intrinsics_share: float = 1e-6
+
+
+_SAME = _SameRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +111,11 @@ def rectified_pair(rig: StereoRig) -> StereoCamera | None:
     x, y, z = T_cam0_cam1[:3, 3]
     same_size = (a.width, a.height) == (b.width, b.height)
     same = np.allclose(
-        (a.fu, a.fv, a.cu, a.cv), (b.fu, b.fv, b.cu, b.cv), rtol=_SAME_INTRINSICS, atol=0
+        (a.fu, a.fv, a.cu, a.cv), (b.fu, b.fv, b.cu, b.cv), rtol=_SAME.intrinsics_share, atol=0
     )
     aligned = (
-        np.abs(T_cam0_cam1[:3, :3] - np.eye(3)).max() <= _ALIGNED_RAD
-        and np.hypot(y, z) <= _ALIGNED_SHARE * x
+        np.abs(T_cam0_cam1[:3, :3] - np.eye(3)).max() <= _SAME.aligned_rad
+        and np.hypot(y, z) <= _SAME.aligned_share * x
     )
     if not (a.model == b.model == "pinhole" and same_size and same and aligned and x > 0):
         return None

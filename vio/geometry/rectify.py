@@ -8,7 +8,7 @@ vision (1999) on splitting the rotation.
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -30,14 +30,24 @@ MapArray = npt.NDArray[np.float32]
 Interpolation: TypeAlias = Literal["linear", "cubic", "lanczos4"]
 ProjectionMode: TypeAlias = Literal["auto", "pinhole", "cylinder"]
 
-_BORDER_SAMPLES = 60  # points along each image border that determine the common field of view
-_MAX_TANGENT = 1.4  # beyond about 54 degrees off axis a planar image only stretches pixels
-PINHOLE_REACH = float(np.arctan(_MAX_TANGENT))  # radians
+
+class _ViewRules(NamedTuple):
+    """What of the lenses' views is kept."""
+
+    # points along each image border that determine the common field of view
+    border_samples: int = 60
+    # beyond about 54 degrees off axis a planar image only stretches pixels
+    max_tangent: float = 1.4
+    min_tangent_width: float = 0.1
+    # a camera that needs a larger rotation is not one half of a stereo pair
+    max_rotation_deg: float = 30.0
+
+
+_VIEW = _ViewRules()
+PINHOLE_REACH = float(np.arctan(_VIEW.max_tangent))  # radians
 # Of a cylinder's rows, azimuths: further round, the rays of a lens of 195 degrees are its dark rim.
-_MAX_ROW = {"pinhole": _MAX_TANGENT, "cylinder": np.pi / 2}
-_MIN_TANGENT_WIDTH = 0.1
+_MAX_ROW = {"pinhole": _VIEW.max_tangent, "cylinder": np.pi / 2}
 _ROWS = 16  # of a map, computed at a time: the arrays between stay in the processor's cache
-_MAX_ROTATION_DEG = 30.0  # a camera that needs a larger rotation is not one half of a stereo pair
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +87,7 @@ def rectified_cameras(rig: StereoRig, projection: ProjectionMode = "pinhole") ->
     chosen = projection_of(rig) if projection == "auto" else projection
     low, high = _common_rectangle(rig, R_rect_cam0, R_rect_cam1, chosen)
     extent = high - low
-    if extent.min() < _MIN_TANGENT_WIDTH:
+    if extent.min() < _VIEW.min_tangent_width:
         raise CalibrationError(
             "the two cameras share no field of view; check the extrinsics T_BS of both cameras"
         )
@@ -127,7 +137,7 @@ def rectifying_rotations(rig: StereoRig) -> tuple[FloatArray, FloatArray, float]
     R_rect_cam1 = R_rect_cam0 @ R_cam0_cam1
     for name, R in (("left", R_rect_cam0), ("right", R_rect_cam1)):
         angle_deg = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
-        if angle_deg > _MAX_ROTATION_DEG:
+        if angle_deg > _VIEW.max_rotation_deg:
             raise CalibrationError(
                 f"rectifying would rotate the {name} camera by {angle_deg:.0f} deg; cam1 must be "
                 "to the right of cam0, "
@@ -176,7 +186,7 @@ def field_of_view(camera: CameraModel | StereoCamera) -> tuple[float, float]:
         raise CalibrationError("a field of view needs the image size; this camera has none")
     w = camera.width - 1.0
     h = camera.height - 1.0
-    s = np.linspace(0, 1, 2 * _BORDER_SAMPLES + 1)
+    s = np.linspace(0, 1, 2 * _VIEW.border_samples + 1)
     spans = []
     for uv in (np.stack([w * s, 0 * s + h / 2], axis=1), np.stack([0 * s + w / 2, h * s], axis=1)):
         ray, valid = (
@@ -187,7 +197,9 @@ def field_of_view(camera: CameraModel | StereoCamera) -> tuple[float, float]:
         off_axis = np.arctan2(np.hypot(ray[:, 0], ray[:, 1]), ray[:, 2])
         off_axis = off_axis if valid is None else np.where(valid, off_axis, 0.0)
         spans.append(
-            float(off_axis[: _BORDER_SAMPLES + 1].max() + off_axis[_BORDER_SAMPLES:].max())
+            float(
+                off_axis[: _VIEW.border_samples + 1].max() + off_axis[_VIEW.border_samples :].max()
+            )
         )
     return spans[0], spans[1]
 
@@ -210,8 +222,8 @@ def pinhole_within(camera: StereoCamera) -> StereoCamera:
     high = np.clip((size - centre) / focal, -1.2, 1.2)
     low[1] = np.tan(low[1])
     high[1] = np.tan(high[1])
-    low = np.maximum(low, -_MAX_TANGENT)
-    high = np.minimum(high, _MAX_TANGENT)
+    low = np.maximum(low, -_VIEW.max_tangent)
+    high = np.minimum(high, _VIEW.max_tangent)
     f = float(np.max(size / (high - low)))
     cu, cv = (size / 2 - f * (low + high) / 2).tolist()
     return StereoCamera(f, f, cu, cv, camera.baseline_m, camera.width, camera.height)
@@ -283,7 +295,7 @@ def _inner_rectangle(
     """
     w = camera.width - 1.0
     h = camera.height - 1.0
-    s = np.linspace(0, 1, _BORDER_SAMPLES)
+    s = np.linspace(0, 1, _VIEW.border_samples)
     sides = {
         "left": np.stack([0 * s, h * s], axis=1),
         "right": np.stack([0 * s + w, h * s], axis=1),
@@ -299,7 +311,7 @@ def _inner_rectangle(
         direction = {"left": [-1, 0], "right": [1, 0], "top": [0, -1], "bottom": [0, 1]}[name]
         far = np.array(direction, dtype=np.float64) * 1e9
         plane[name] = np.where(ahead[:, None], on_plane, far)
-    most = np.array([_MAX_TANGENT, _MAX_ROW[projection]])
+    most = np.array([_VIEW.max_tangent, _MAX_ROW[projection]])
     top = max(plane["top"][:, 1].max(), -most[1])
     bottom = min(plane["bottom"][:, 1].min(), most[1])
     # the corners of a wide lens look backwards, beyond the rows that are kept

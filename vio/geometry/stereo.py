@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Integral, Real
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -33,8 +33,16 @@ CameraKind: TypeAlias = Literal["stereo", "rgbd", "mono"]
 # it is the nearest depth, and a track enters the estimate once its inverse depth is known as well
 # as by a stereo pair of this baseline.
 MONO_UNIT_M = 0.1
-_SHORT_M = 0.005  # baselines outside are those of another unit
-_LONG_M = 5.0
+
+
+class _BaselineRules(NamedTuple):
+    """Baselines of usual units."""
+
+    min_m: float = 0.005  # baselines outside are those of another unit
+    max_m: float = 5.0
+
+
+_BASELINE = _BaselineRules()
 _YZ: TypeAlias = tuple[FloatArray | float, FloatArray | float]
 
 
@@ -153,7 +161,7 @@ class StereoCamera:
 
         Of stereo pairs; those of one camera and of depth images are made up.
         """
-        if self.kind != "stereo" or _SHORT_M <= self.baseline_m <= _LONG_M:
+        if self.kind != "stereo" or _BASELINE.min_m <= self.baseline_m <= _BASELINE.max_m:
             return None
         return (
             f"a baseline of {self.baseline_m:g} m is implausible; translations are metres: check "

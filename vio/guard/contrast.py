@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from vio.frontend.patches import mean_and_contrast
 from vio.guard.image_check import FrameImages, ImageCheck
 
-_MAX_FRAMES = 5  # in a row that are left out; then the front end sees them, and drops its tracks
-_STRIDE = 4  # every fourth pixel of the half image is used
-_LOST_SHARE = 0.1  # share of the last image's contrast below which the contrast counts as lost
+
+class _ContrastRules(NamedTuple):
+    """When an image has lost its contrast."""
+
+    # in a row that are left out; then the front end sees them, and drops its tracks
+    max_frames: int = 5
+    stride_px: int = 4  # every fourth pixel of the half image is used
+    # share of the last image's contrast below which the contrast counts as lost
+    lost_share: float = 0.1
+
+
+_CONTRAST = _ContrastRules()
 
 
 class LostContrast(ImageCheck):
@@ -22,9 +33,9 @@ class LostContrast(ImageCheck):
 
     def inspect(self, images: FrameImages) -> FrameImages:
         """Leave out a frame without contrast where the previous one had some."""
-        contrast = mean_and_contrast(images.halves[0], _STRIDE)[1]
-        lost = self._contrast is not None and contrast < _LOST_SHARE * self._contrast
-        if lost and self._skipped < _MAX_FRAMES:
+        contrast = mean_and_contrast(images.halves[0], _CONTRAST.stride_px)[1]
+        lost = self._contrast is not None and contrast < _CONTRAST.lost_share * self._contrast
+        if lost and self._skipped < _CONTRAST.max_frames:
             self._skipped += 1
             return images.marked(skipped=True)
         self._skipped = 0

@@ -18,6 +18,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
@@ -27,15 +28,23 @@ from vio.guard.image_check import FrameImages, ImageCheck, images_of
 from vio.guard.probe import RowProbe
 from vio.records import Image, IntArray, StereoFrame
 
-_FRAMES = 3  # that must have been counted
-_ALIKE = 2  # frames in a row after which the counts so far tell the same
-_MAX_TESTS = 40  # frames in which the rig moves, after which the pairing counts as right
-_MIN_POINTS = 30  # corners in a frame
-_MIN_CHANGE = 2.0  # of the left image since the last frame, gray levels at the common contrast
-_STRIDE = 4  # of the pixels that are compared
-_MAX_DELAY = 3  # frames that images of a pair may be apart
-_MIN_SHARE = 0.4  # of the corners that match in the best pairing
-_CLEARLY = 1.3  # times as many as in both others
+
+class _PairingRules(NamedTuple):
+    """When left images belong to the right images of another frame."""
+
+    counted_frames: int = 3  # that must have been counted
+    alike_frames: int = 2  # frames in a row after which the counts so far tell the same
+    max_tests: int = 40  # frames in which the rig moves, after which the pairing counts as right
+    min_points: int = 30  # corners in a frame
+    # of the left image since the last frame, gray levels at the common contrast
+    min_change: float = 2.0
+    stride_px: int = 4  # of the pixels that are compared
+    max_delay_frames: int = 3  # frames that images of a pair may be apart
+    min_share: float = 0.4  # of the corners that match in the best pairing
+    clear_factor: float = 1.3  # times as many as in both others
+
+
+_PAIRING = _PairingRules()
 
 
 def told_delay(points: int, matched: Mapping[int, int]) -> int | None:
@@ -47,8 +56,8 @@ def told_delay(points: int, matched: Mapping[int, int]) -> int | None:
     """
     best = max(matched, key=lambda delay: matched[delay])
     others = max(count for delay, count in matched.items() if delay != best)
-    clear = matched[best] >= max(_MIN_SHARE * points, _CLEARLY * others)
-    return best if clear and points >= _MIN_POINTS else None
+    clear = matched[best] >= max(_PAIRING.min_share * points, _PAIRING.clear_factor * others)
+    return best if clear and points >= _PAIRING.min_points else None
 
 
 @dataclass(frozen=True)
@@ -72,14 +81,18 @@ class PairingCheck(ImageCheck):
         super().__init__()
         self._probe = probe
         self._last: _Halves | None = None  # the last frame that was counted
-        self._recent = deque[_Halves](maxlen=_MAX_DELAY)  # the frames before this one
+        self._recent = deque[_Halves](
+            maxlen=_PAIRING.max_delay_frames
+        )  # the frames before this one
         self._told: list[int | None] = []  # by the counts so far, after each frame
         # of all frames: corners, and those that match in each pairing
         self._points = 0
         self._matched = {0: 0, 1: 0, -1: 0}
         # likewise in all pairings, of the frames in which the pairs are not the best ones
         self._far_points = 0
-        self._far_matched = dict.fromkeys(range(-_MAX_DELAY, _MAX_DELAY + 1), 0)
+        self._far_matched = dict.fromkeys(
+            range(-_PAIRING.max_delay_frames, _PAIRING.max_delay_frames + 1), 0
+        )
         self._near: dict[int, IntArray] = {}  # likewise (K,) on rows a little above and below
         self._held = deque[Image]()  # right images that belong to later left ones
         self._begun_again = False
@@ -109,7 +122,11 @@ class PairingCheck(ImageCheck):
         now = _Halves(left.copy(), right.copy(), self._probe)
         last = self._last
         moved = last is None or (
-            image_change(left[::_STRIDE, ::_STRIDE], last.left[::_STRIDE, ::_STRIDE]) >= _MIN_CHANGE
+            image_change(
+                left[:: _PAIRING.stride_px, :: _PAIRING.stride_px],
+                last.left[:: _PAIRING.stride_px, :: _PAIRING.stride_px],
+            )
+            >= _PAIRING.min_change
         )
         if moved:
             self._last = now
@@ -121,15 +138,19 @@ class PairingCheck(ImageCheck):
     def _count(self, index: int, now: _Halves, last: _Halves) -> None:
         """Count the matches of a frame, and decide once those of enough frames tell."""
         points = min(len(now.corners), len(last.corners))
-        if points >= _MIN_POINTS:
+        if points >= _PAIRING.min_points:
             self._points += points
             self._add({0: (now, now), 1: (last, now), -1: (now, last)}, self._matched)
         told = told_delay(self._points, self._matched)
         self._told.append(told if told == 0 else self._far_delay(now))
-        recent = self._told[-_ALIKE:]
-        if len(self._told) >= _FRAMES and recent[0] is not None and len(set(recent)) == 1:
+        recent = self._told[-_PAIRING.alike_frames :]
+        if (
+            len(self._told) >= _PAIRING.counted_frames
+            and recent[0] is not None
+            and len(set(recent)) == 1
+        ):
             self._decide(index, recent[0])
-        elif len(self._told) >= _MAX_TESTS:
+        elif len(self._told) >= _PAIRING.max_tests:
             self._decide(index, 0)
 
     def _add(
@@ -143,15 +164,15 @@ class PairingCheck(ImageCheck):
         """Count the matches of a frame in all pairings, and return the delay that they tell, unless
         a difference of all rows explains the pairs as they came as well.
         """
-        if len(self._recent) < _MAX_DELAY:
+        if len(self._recent) < _PAIRING.max_delay_frames:
             return None
         pairings = {0: (now, now)}
-        for delay in range(1, _MAX_DELAY + 1):
+        for delay in range(1, _PAIRING.max_delay_frames + 1):
             before = self._recent[-delay]
             pairings[delay] = before, now
             pairings[-delay] = now, before
         points = min(len(left.corners) for left, _ in pairings.values())
-        if points < _MIN_POINTS:
+        if points < _PAIRING.min_points:
             return None
         self._far_points += points
         self._add(pairings, self._far_matched)

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 from vio.errors import DataError
 from vio.guard.image_check import FrameImages, ImageCheck
 from vio.guard.probe import RowProbe
 
-_FRAMES = 3  # consecutive suspicious frames before an error is raised
-_MIN_POINTS = 20  # with fewer corners the check is skipped
-_FEW = 0.3  # share of corners with a match below which the mirrored images are checked
-_MANY = 0.4  # share of corners matched in the mirrored images that indicates a swap
+
+class _SwapRules(NamedTuple):
+    """When images are exchanged."""
+
+    frames: int = 3  # consecutive suspicious frames before an error is raised
+    min_points: int = 20  # with fewer corners the check is skipped
+    # share of corners with a match below which the mirrored images are checked
+    few_share: float = 0.3
+    many_share: float = 0.4  # share of corners matched in the mirrored images that indicates a swap
+
+
+_SWAP = _SwapRules()
 
 
 class SwapDetector(ImageCheck):
@@ -31,7 +40,7 @@ class SwapDetector(ImageCheck):
     @property
     def decided(self) -> bool:
         """Whether the recording is known to be in order."""
-        return self._in_order >= _FRAMES
+        return self._in_order >= _SWAP.frames
 
     def inspect(self, images: FrameImages) -> FrameImages:
         """Compare the images of the first frames.
@@ -44,7 +53,7 @@ class SwapDetector(ImageCheck):
         left, right = images.halves
         points = self._probe.corners(left)
         matched = 0
-        if len(points) >= _MIN_POINTS:
+        if len(points) >= _SWAP.min_points:
             matched = self._probe.positive(left, right, points)
         self.check(
             images.index,
@@ -63,20 +72,20 @@ class SwapDetector(ImageCheck):
         Raises:
             DataError: left and right look swapped.
         """
-        if corners < _MIN_POINTS:
+        if corners < _SWAP.min_points:
             return
-        if matched >= _FEW * corners:
+        if matched >= _SWAP.few_share * corners:
             self._suspicious = 0
             self._in_order += 1
             return
         mirrored = count_mirrored()
-        if mirrored >= max(_MANY * corners, 2 * matched):
+        if mirrored >= max(_SWAP.many_share * corners, 2 * matched):
             self._suspicious += 1
-        elif self._suspicious < _FRAMES:
+        elif self._suspicious < _SWAP.frames:
             self._suspicious = 0
-        if self._suspicious >= _FRAMES:
+        if self._suspicious >= _SWAP.frames:
             raise DataError(
                 f"frame {index}: left and right images look swapped ({mirrored} of "
                 f"{corners} features match with a negative disparity, {matched} with a positive "
-                f"one, in {_FRAMES} frames); exchange the image folders or the cameras' calibration"
+                f"one, in {_SWAP.frames} frames); exchange the image folders or the cameras' calibration"
             )

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.imu.findings import InertialFinding
 from vio.records import S_PER_NS, IntArray
 
-_COVERED = 0.97  # share of the frames that must have samples …
-_UNCOVERED_S = 1.0  # … unless the uncovered time is shorter
-_LATE_S = 0.1  # a frame has a sample if the last one is no older
+
+class _ClockRules(NamedTuple):
+    """When the IMU's stamps cover the frames."""
+
+    min_covered_share: float = 0.97  # share of the frames that must have samples …
+    max_uncovered_s: float = 1.0  # … unless the uncovered time is shorter
+    max_late_s: float = 0.1  # a frame has a sample if the last one is no older
+
+
+_CLOCKS = _ClockRules()
 _NO_IMU_FRAMES = 10  # missing samples are reported after so many frames and so much time
 _NO_IMU_S = 0.4
 
@@ -29,7 +38,7 @@ def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[Iner
     if covered == 0.0:
         return (_no_overlap(frames, imu, step_ns),)
     uncovered_s = (1 - covered) * (frames[1] - frames[0]) * S_PER_NS
-    enough = covered >= _COVERED or uncovered_s < _UNCOVERED_S
+    enough = covered >= _CLOCKS.min_covered_share or uncovered_s < _CLOCKS.max_uncovered_s
     return () if enough else (_part_overlap(frames, imu, step_ns, covered),)
 
 
@@ -49,7 +58,7 @@ class SampleCoverage:
         self._first_ns = time_ns if self._first_ns is None else self._first_ns
         self._last_ns = time_ns
         self._frames += 1
-        if last_imu_ns is not None and (time_ns - last_imu_ns) * S_PER_NS <= _LATE_S:
+        if last_imu_ns is not None and (time_ns - last_imu_ns) * S_PER_NS <= _CLOCKS.max_late_s:
             self._covered += 1 + self._in_gap
             self._in_gap = 0
         elif self._covered:
@@ -67,14 +76,14 @@ class SampleCoverage:
 
     def at_end(self, imu: tuple[int, int] | None, step_ns: float) -> list[InertialFinding]:
         """Report that none or only a part of the frames had samples; arguments as for `so_far`."""
-        if not self._frames or self._covered >= _COVERED * self._frames:
+        if not self._frames or self._covered >= _CLOCKS.min_covered_share * self._frames:
             return []
         if self._covered == 0:
             return [_no_overlap(self._span, imu, step_ns)]
         share = self._covered / self._frames
-        if imu is None or (1 - share) * self._seconds < _UNCOVERED_S:
+        if imu is None or (1 - share) * self._seconds < _CLOCKS.max_uncovered_s:
             return []
-        late_ns = _LATE_S / S_PER_NS
+        late_ns = _CLOCKS.max_late_s / S_PER_NS
         if imu[0] - late_ns <= self._span[0] and self._span[1] <= imu[1] + late_ns:
             return []  # samples that came late, as where live use is under load
         return [_part_overlap(self._span, imu, step_ns, share)]

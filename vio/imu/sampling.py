@@ -4,19 +4,28 @@ bursts, or not recorded at all.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, ImuRecord, IntArray
 
-# below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
-_MIN_HZ = 50.0
-_MIN_ROWS = 20  # of equal readings, or bursts
-_MIN_REPEATS = 3  # of a reading in a row, that a driver gives again and again
-_ALIKE = 0.8  # share of the rows that are about as long as the median
-_BURST = 0.2  # of the mean interval, below which the median one is that of bursts
-_PAUSES = 0.8  # share of the time that passes between bursts
+
+class _RateRules(NamedTuple):
+    """When samples come often enough, and one by one."""
+
+    # below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
+    min_hz: float = 50.0
+    min_rows: int = 20  # of equal readings, or bursts
+    min_repeats: int = 3  # of a reading in a row, that a driver gives again and again
+    alike_share: float = 0.8  # share of the rows that are about as long as the median
+    burst_share: float = 0.2  # of the mean interval, below which the median one is that of bursts
+    pauses_share: float = 0.8  # share of the time that passes between bursts
+
+
+_RATES = _RateRules()
 
 
 def sampling_notes(record: ImuRecord, where: str) -> tuple[str, ...]:
@@ -42,10 +51,10 @@ def sampling_notes(record: ImuRecord, where: str) -> tuple[str, ...]:
             f"{where}: each reading is given {repeats} times, so the IMU has {rate_hz:.3g} Hz, not "
             f"{rate_hz * repeats:.3g}; record each reading once"
         )
-    if rate_hz < _MIN_HZ:
+    if rate_hz < _RATES.min_hz:
         notes.append(
             f"{where}: the IMU has {rate_hz:.3g} Hz, too few to integrate the motion between "
-            f"images; record at least {_MIN_HZ:g} Hz, or use --motion none"
+            f"images; record at least {_RATES.min_hz:g} Hz, or use --motion none"
         )
     return tuple(notes)
 
@@ -82,11 +91,11 @@ def repeated_readings(values: FloatArray) -> int:
     """
     changed = np.flatnonzero((values[1:] != values[:-1]).any(axis=1))
     lengths = np.diff(changed)
-    if len(lengths) < _MIN_ROWS:
+    if len(lengths) < _RATES.min_rows:
         return 0
     usual = round(median(lengths))
     alike = np.mean(np.abs(lengths - usual) <= 1)
-    return usual if usual >= _MIN_REPEATS and alike >= _ALIKE else 0
+    return usual if usual >= _RATES.min_repeats and alike >= _RATES.alike_share else 0
 
 
 def burst_length(times_ns: IntArray) -> int:
@@ -94,7 +103,7 @@ def burst_length(times_ns: IntArray) -> int:
     steps = np.diff(times_ns).astype(np.float64)
     mean = float(steps.mean())
     pauses = steps > mean
-    if pauses.sum() < _MIN_ROWS or median(steps) >= _BURST * mean:
+    if pauses.sum() < _RATES.min_rows or median(steps) >= _RATES.burst_share * mean:
         return 0
     share = float(steps[pauses].sum() / steps.sum())
-    return round(len(steps) / int(pauses.sum())) if share >= _PAUSES else 0
+    return round(len(steps) / int(pauses.sum())) if share >= _RATES.pauses_share else 0

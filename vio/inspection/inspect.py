@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +34,16 @@ from vio.records import (
 PAIRS = 12  # or single images looked at, spread over the recording
 TRACKED = 60  # frames tracked to compare the IMU with the images' motion
 _SETTLED_NS = 5 * NS_PER_S  # of frames that an accelerometer is compared with
-_MAX_TRACKED = 200
-_VIDEO_FRAMES = 300  # of a video, which can only be decoded in order
+
+
+class _LookedAt(NamedTuple):
+    """How much of a recording is looked at."""
+
+    max_tracked: int = 200
+    video_frames: int = 300  # of a video, which can only be decoded in order
+
+
+_LOOKED_AT = _LookedAt()
 
 
 def inspect_recording(
@@ -77,7 +86,7 @@ def _frames_to_track(recording: Recording, times_ns: IntArray, tracked: int) -> 
     if "imu" not in recording.motion or not doubts_among(recording.notes):
         return tracked
     within = int(np.searchsorted(times_ns, times_ns[0] + _SETTLED_NS))
-    return max(tracked, min(within, _MAX_TRACKED))
+    return max(tracked, min(within, _LOOKED_AT.max_tracked))
 
 
 def camera_part(recording: Recording) -> Part:
@@ -117,7 +126,7 @@ def _spread(
     """Read some frames, spread over a range."""
     last = of[-1]
     if dataset.recording.kind == "video":
-        last = min(last, of[0] + _VIDEO_FRAMES - 1)
+        last = min(last, of[0] + _LOOKED_AT.video_frames - 1)
     chosen = np.unique(np.linspace(of[0], last, pairs).astype(int)).tolist()
     frames: list[StereoFrame] = []
     for done, k in enumerate(chosen):
@@ -262,9 +271,15 @@ def _missing_part(recording: Recording) -> Part:
     return Part("missing", "; ".join(missing) or "nothing is missing", {"missing": missing}, faults)
 
 
-_GAP = 1.5  # intervals longer than this multiple of the median are gaps
-_EVEN_MS = 1e-3  # a jitter below it is rounding of the stamps
-_MIN_IMU_HZ = 50.0  # as the readers say it
+class _StampRules(NamedTuple):
+    """What is said of the stamps."""
+
+    gap_steps: float = 1.5  # intervals longer than this multiple of the median are gaps
+    even_ms: float = 1e-3  # a jitter below it is rounding of the stamps
+    min_imu_hz: float = 50.0  # as the readers say it
+
+
+_STAMPS = _StampRules()
 
 
 def frames_part(times: IntArray) -> Part:
@@ -290,11 +305,11 @@ def clock_part(
     facts |= {} if rate_hz is None else {"rate_hz": rate_hz}
     faults = []
     if name == "IMU":
-        if facts["rate_hz"] is not None and facts["rate_hz"] < _MIN_IMU_HZ:
+        if facts["rate_hz"] is not None and facts["rate_hz"] < _STAMPS.min_imu_hz:
             faults.append(
                 f"{facts['rate_hz']:.3g} Hz are too few to integrate the motion between images; "
                 "record at least "
-                f"{_MIN_IMU_HZ:g} Hz, or use --motion none"
+                f"{_STAMPS.min_imu_hz:g} Hz, or use --motion none"
             )
         faults += [finding.message for finding in judge_clocks(frame_times_ns, times_ns)]
     inside = (frame_times_ns >= times_ns[0]) & (frame_times_ns <= times_ns[-1])
@@ -310,7 +325,7 @@ def clock_facts(times_ns: IntArray) -> dict[str, float | int | None]:
         return {"count": len(times_ns), "duration_s": 0.0, "rate_hz": None}
     steps = np.diff(times_ns).astype(np.float64) / NS_PER_S
     median = float(np.median(steps))
-    gaps = steps > _GAP * median
+    gaps = steps > _STAMPS.gap_steps * median
     return {
         "count": len(times_ns),
         "duration_s": float(times_ns[-1] - times_ns[0]) / NS_PER_S,
@@ -330,5 +345,5 @@ def _text(facts: dict[str, float | int | None]) -> str:
         else ", no gap"
     )
     jitter_ms = facts["jitter_ms"] or 0.0
-    jitter = "even" if jitter_ms < _EVEN_MS else f"jitter {jitter_ms:.3g} ms"
+    jitter = "even" if jitter_ms < _STAMPS.even_ms else f"jitter {jitter_ms:.3g} ms"
     return f" in {facts['duration_s']:.2f} s, {facts['rate_hz']:.4g} Hz, {jitter}{gaps}"

@@ -7,13 +7,22 @@ from __future__ import annotations
 import time
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-_KEPT = 1000  # results that the median and the bound of 95 % are taken of
-_LATE_S = 0.5  # results older than that, one after another, mean that the computer is too slow
-_LATE_RESULTS = 10
-_MAX_LEFT_OUT = 10  # of the newest hundred frames
+
+class _FigureRules(NamedTuple):
+    """When a computer is too slow."""
+
+    kept_results: int = 1000  # results that the median and the bound of 95 % are taken of
+    # results older than that, one after another, mean that the computer is too slow
+    late_s: float = 0.5
+    late_results: int = 10
+    max_left_out_frames: int = 10  # of the newest hundred frames
+
+
+_FIGURES = _FigureRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +54,7 @@ class LiveMonitor:
         self._judges = judges_latency
         # time of the frame, ns, and of its arrival, s
         self._arrived: deque[tuple[int, float]] = deque()
-        self._latencies_s: deque[float] = deque(maxlen=_KEPT)
+        self._latencies_s: deque[float] = deque(maxlen=_FIGURES.kept_results)
         self._left_out: deque[bool] = deque(maxlen=100)
         self._late = 0  # results in a row
         self._worst_s = 0.0
@@ -77,12 +86,12 @@ class LiveMonitor:
         self.results += 1
         self._latencies_s.append(latency)
         self._worst_s = max(self._worst_s, latency)
-        self._late = self._late + 1 if latency > _LATE_S else 0
+        self._late = self._late + 1 if latency > _FIGURES.late_s else 0
         left_out = sum(self._left_out)
         if (
             self._warned
             or not self._judges
-            or (self._late < _LATE_RESULTS and left_out < _MAX_LEFT_OUT)
+            or (self._late < _FIGURES.late_results and left_out < _FIGURES.max_left_out_frames)
         ):
             return None
         self._warned = True

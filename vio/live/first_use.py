@@ -14,7 +14,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -30,13 +30,21 @@ log = logging.getLogger(__name__)
 
 Part: TypeAlias = Literal["frontend", "filter"]
 _CAMERA = StereoCamera(300.0, 300.0, 320.0, 180.0, 0.1, 640, 360)
-_FRAMES = 30
-_STEP_NS = 50_000_000
-_SAMPLES = 10  # of a motion sensor, a frame
-_POINTS = 150
-_SHORTEST = 4  # frames that a feature is seen in
-_LONGEST = 40
-_NOISE_PX = 0.1
+
+
+class _MadeUpRun(NamedTuple):
+    """The run that is made up to be compiled for."""
+
+    frames: int = 30
+    step_ns: int = 50_000_000
+    samples_per_frame: int = 10  # of a motion sensor, a frame
+    points: int = 150
+    min_track_frames: int = 4  # frames that a feature is seen in
+    max_track_frames: int = 40
+    noise_px: float = 0.1
+
+
+_RUN = _MadeUpRun()
 
 
 @contextmanager
@@ -88,8 +96,8 @@ def _run_frontend(config: Config) -> None:
 
     frontend = build_frontend("auto", _CAMERA, config.frontend)
     source = SwayingCamera(_CAMERA, np.eye(4), config.imu.gravity_mps2)
-    for index in range(_FRAMES):
-        time_ns = index * _STEP_NS
+    for index in range(_RUN.frames):
+        time_ns = index * _RUN.step_ns
         left, right, _ = source.images(time_ns)
         frontend.process(StereoFrame(index, time_ns, left, right))
 
@@ -102,10 +110,10 @@ def _run_filter(config: Config) -> None:
     odometry = Odometry(_CAMERA, config, T_cam0_imu=T_cam0_imu)
     source = SwayingCamera(_CAMERA, odometry.T_cam0_body, config.imu.gravity_mps2)
     features = _Features()
-    for index in range(_FRAMES):
-        time_ns = index * _STEP_NS
-        for k in range(1 - _SAMPLES, 1):
-            sample_ns = time_ns + k * _STEP_NS // _SAMPLES
+    for index in range(_RUN.frames):
+        time_ns = index * _RUN.step_ns
+        for k in range(1 - _RUN.samples_per_frame, 1):
+            sample_ns = time_ns + k * _RUN.step_ns // _RUN.samples_per_frame
             if odometry.motion == "imu":
                 odometry.add_imu(sample_ns, *source.imu(sample_ns))
             elif odometry.motion == "velocity":
@@ -123,10 +131,10 @@ class _Features:
 
     def __init__(self) -> None:
         self._random = np.random.default_rng(0)
-        self._ids: IntArray = np.arange(_POINTS)
-        self._next_id = _POINTS
-        self._points = self._new(_POINTS)
-        self._ends: IntArray = self._random.integers(1, _LONGEST, _POINTS)
+        self._ids: IntArray = np.arange(_RUN.points)
+        self._next_id = _RUN.points
+        self._points = self._new(_RUN.points)
+        self._ends: IntArray = self._random.integers(1, _RUN.max_track_frames, _RUN.points)
 
     def _new(self, count: int) -> FloatArray:
         """Return points (count, 3) in the first camera's frame, x right and z ahead."""
@@ -144,12 +152,14 @@ class _Features:
             self._ids[ended] = self._next_id + np.arange(len(ended))
             self._next_id += len(ended)
             self._points[ended] = self._new(len(ended)) + np.array([x_m, 0.0, 0.0])
-            self._ends[ended] = index + self._random.integers(_SHORTEST, _LONGEST, len(ended))
+            self._ends[ended] = index + self._random.integers(
+                _RUN.min_track_frames, _RUN.max_track_frames, len(ended)
+            )
         x, y, depth_m = self._points.T
         u = _CAMERA.fu * (x - x_m) / depth_m + _CAMERA.cu
         v = _CAMERA.fv * y / depth_m + _CAMERA.cv
         z = np.stack([u, v, u - _CAMERA.fu * _CAMERA.baseline_m / depth_m, v], axis=1)
-        z += self._random.normal(0.0, _NOISE_PX, z.shape)
+        z += self._random.normal(0.0, _RUN.noise_px, z.shape)
         inside = (z[:, 0] > 0) & (z[:, 0] < 639) & (z[:, 2] > 0)
         return self._ids[inside], z[inside]
 

@@ -8,7 +8,7 @@ import operator
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -28,10 +28,21 @@ from vio.records import (
     observations,
 )
 
-_MAX_NS = 2**62  # differences of times stay within 64 bits
-# a stamp so far ahead, and so many times the last step, is to be confirmed
-_JUMP_NS = 2_000_000_000
-_JUMP_STEPS = 5
+
+class _StampRules(NamedTuple):
+    """Which stamps of a live program are doubted."""
+
+    max_ns: int = 2**62  # differences of times stay within 64 bits
+    # a stamp so far ahead, and so many times the last step, is to be confirmed
+    jump_ns: int = 2_000_000_000
+    jump_steps: int = 5
+    # Steps that are shorter from the start are of another unit: frames at 2 kHz, samples at 100 kHz.
+    min_frame_step_ns: int = 500_000
+    min_sample_step_ns: int = 10_000
+    short_steps: int = 2  # in a row before the unit is doubted: two frames may share an arrival
+
+
+_STAMPS = _StampRules()
 
 
 Kind: TypeAlias = Literal["stereo", "mono", "rgbd"]
@@ -39,10 +50,6 @@ Kind: TypeAlias = Literal["stereo", "mono", "rgbd"]
 Shapes: TypeAlias = "tuple[tuple[int, int] | None, ...]"
 
 _CAME = {"stereo": "two images", "mono": "one image", "rgbd": "an image with depths"}
-# Steps that are shorter from the start are of another unit: frames at 2 kHz, samples at 100 kHz.
-_MIN_FRAME_STEP_NS = 500_000
-_MIN_SAMPLE_STEP_NS = 10_000
-_SHORT_STEPS = 2  # in a row before the unit is doubted: two frames may share an arrival
 _TAKES = {
     "stereo": "two images; give both, or load_rig(..., cameras=1)",
     "mono": "one image without depth_m; depths need a rig with a depth_factor",
@@ -92,8 +99,8 @@ class Inputs:
         self._offset_ns = offset_ns
         self._limit = FrameRateLimit(most_hz)
         self._say = say
-        self._frames = _Stamps("frame", _MIN_FRAME_STEP_NS)
-        self._samples = _Stamps("sample", _MIN_SAMPLE_STEP_NS)
+        self._frames = _Stamps("frame", _STAMPS.min_frame_step_ns)
+        self._samples = _Stamps("sample", _STAMPS.min_sample_step_ns)
         self._count = 0  # of frames
         self._kind: str | None = None  # of frames: images or observations
 
@@ -229,7 +236,7 @@ class _Stamps:
     def _check_unit(self, time_ns: int) -> None:
         """Raise DataError where all steps so far are too short for nanoseconds."""
         last_ns = self._last_ns
-        if last_ns is None or self._units_known or self._short < _SHORT_STEPS:
+        if last_ns is None or self._units_known or self._short < _STAMPS.short_steps:
             return
         # Refused stamps count as well: steps over several of them are as long as right ones.
         if self._refused_ns is not None and last_ns < self._refused_ns < time_ns:
@@ -239,7 +246,7 @@ class _Stamps:
 
     def check_steps(self, times_ns: list[int]) -> None:
         """Raise DataError where all steps between several first stamps are too short."""
-        if len(times_ns) > _SHORT_STEPS and not self._units_known:
+        if len(times_ns) > _STAMPS.short_steps and not self._units_known:
             self._refuse(max(b - a for a, b in pairwise(times_ns)))
 
     def _refuse(self, step_ns: int) -> None:
@@ -254,11 +261,11 @@ class _Stamps:
         """Whether an event may be taken; its time is after the last one that was."""
         last_ns = self._last_ns
         step_ns = 0 if last_ns is None else time_ns - last_ns
-        if step_ns > max(_JUMP_NS, _JUMP_STEPS * self._step_ns) and self._step_ns:
+        if step_ns > max(_STAMPS.jump_ns, _STAMPS.jump_steps * self._step_ns) and self._step_ns:
             since_held_ns = 0 if self._held_ns is None else time_ns - self._held_ns
             # as of a camera whose frames come so slowly, after a first step that was quicker
             is_as_long = 2 * since_held_ns >= step_ns - since_held_ns >= since_held_ns // 2 > 0
-            if not (0 < since_held_ns <= _JUMP_NS or is_as_long):
+            if not (0 < since_held_ns <= _STAMPS.jump_ns or is_as_long):
                 self._held_ns = time_ns
                 say(
                     f"{self._of} at {time_ns} ns: its stamp is {step_ns * 1e-9:.1f} s ahead of the "
@@ -286,7 +293,7 @@ def checked_time(t_ns: Any) -> int:
         time_ns = operator.index(t_ns)
     except TypeError as error:
         raise DataError(f"a time must be an integer number of nanoseconds, got {t_ns!r}") from error
-    if abs(time_ns) > _MAX_NS:
+    if abs(time_ns) > _STAMPS.max_ns:
         raise DataError(f"{time_ns} ns is no time of a clock; give nanoseconds")
     return time_ns
 
@@ -314,7 +321,7 @@ def checked_samples(
     rows = [
         _checked_values(name, value, (len(times), 3), first_ns) for name, value in values.items()
     ]
-    if np.any((times > _MAX_NS) | (times < -_MAX_NS)):
+    if np.any((times > _STAMPS.max_ns) | (times < -_STAMPS.max_ns)):
         raise DataError(f"{times[0]} to {times[-1]} ns are no times of a clock; give nanoseconds")
     if (times[1:] <= times[:-1]).any():  # differences of unsigned ones are never negative
         raise DataError("times of samples must increase; sort them and give each once")

@@ -19,7 +19,7 @@ import urllib.error
 import urllib.request
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -30,10 +30,17 @@ from vio.geometry.stereo import StereoCamera
 from vio.mapping.lookup import FoundPose, MapLookup
 from vio.records import Image
 
-_MAX_BYTES = 64 << 20  # of a request: two images of 16 megapixels
-_SILENT_S = 30.0  # after which a connection that says nothing is closed
+
+class _RequestLimits(NamedTuple):
+    """What a request may be."""
+
+    max_bytes: int = 64 << 20  # of a request: two images of 16 megapixels
+    silent_s: float = 30.0  # after which a connection that says nothing is closed
+    same_camera_share: float = 1e-3  # by which the lengths of one camera may differ
+
+
+_LIMITS = _RequestLimits()
 _CAMERA = ("fu", "fv", "cu", "cv", "baseline_m")
-_SAME = 1e-3  # by which the lengths of one camera may differ
 
 
 class _RefusedError(Exception):
@@ -75,7 +82,7 @@ class MapServer(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"  # a client keeps its connection
-    timeout = _SILENT_S
+    timeout = _LIMITS.silent_s
     server: MapServer
 
     def do_GET(self) -> None:
@@ -110,9 +117,10 @@ class _Handler(BaseHTTPRequestHandler):
             length = int(self.headers["Content-Length"])
         except (TypeError, ValueError):
             raise _RefusedError(HTTPStatus.LENGTH_REQUIRED, "Content-Length is missing") from None
-        if not 0 <= length <= _MAX_BYTES:
+        if not 0 <= length <= _LIMITS.max_bytes:
             raise _RefusedError(
-                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a request has at most {_MAX_BYTES >> 20} MB"
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+                f"a request has at most {_LIMITS.max_bytes >> 20} MB",
             )
         body = self.rfile.read(length)
         if len(body) < length:
@@ -156,7 +164,7 @@ def _pair(body: bytes, camera: StereoCamera) -> tuple[Image, Image]:
         raise _RefusedError(HTTPStatus.BAD_REQUEST, f"{reason} ({type(error).__name__})") from None
     own = _camera_values(camera)
     for name, value in given.items():
-        if not abs(value - own[name]) <= _SAME * abs(own[name]):
+        if not abs(value - own[name]) <= _LIMITS.same_camera_share * abs(own[name]):
             raise _RefusedError(
                 HTTPStatus.CONFLICT, f"camera: {name} is {value:g}, that of the map {own[name]:g}"
             )

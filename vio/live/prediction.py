@@ -6,6 +6,7 @@ import threading
 from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,9 +14,16 @@ from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.records import S_PER_NS, Estimate, ImuSample, MotionSample, VelocitySample, imu_matrices
 
-_KEPT_NS = 2_000_000_000  # samples that a late estimate can be carried over
-_LONGEST_STEP_S = 0.5  # a motion is held no longer than this beyond the last sample or frame
-_MAX_STATES = 10_000  # after the newest estimate: beyond, older ones are forgotten
+
+class _PredictionRules(NamedTuple):
+    """How far a pose is carried on."""
+
+    kept_ns: int = 2_000_000_000  # samples that a late estimate can be carried over
+    max_step_s: float = 0.5  # a motion is held no longer than this beyond the last sample or frame
+    max_states: int = 10_000  # after the newest estimate: beyond, older ones are forgotten
+
+
+_PREDICTION = _PredictionRules()
 _ZERO: FloatArray = np.zeros(3)
 
 
@@ -65,13 +73,13 @@ class PosePredictor:
     def sample(self, sample: MotionSample) -> None:
         """Take a motion sample."""
         self._samples.append(sample)
-        while sample.time_ns - self._samples[0].time_ns > _KEPT_NS:
+        while sample.time_ns - self._samples[0].time_ns > _PREDICTION.kept_ns:
             self._samples.popleft()
         states = self._states
         if states and sample.time_ns > states[-1].time_ns:
             states.append(self._carried(states[-1], sample))
-            if len(states) > _MAX_STATES:
-                self._states = [states[0], *states[-_MAX_STATES // 2 :]]
+            if len(states) > _PREDICTION.max_states:
+                self._states = [states[0], *states[-_PREDICTION.max_states // 2 :]]
 
     def estimate(self, estimate: Estimate) -> None:
         """Take a new estimate, and carry it over the samples that have come since."""
@@ -95,7 +103,7 @@ class PosePredictor:
             if sample.time_ns > estimate.time_ns:
                 states.append(self._carried(states[-1], sample))
         known = [*self._past, *self._states]
-        first = bisect_left(known, estimate.time_ns - _KEPT_NS, key=_time_ns)
+        first = bisect_left(known, estimate.time_ns - _PREDICTION.kept_ns, key=_time_ns)
         self._past = known[first : bisect_left(known, estimate.time_ns, key=_time_ns)]
         self._last = estimate
         self._states = states
@@ -118,7 +126,7 @@ class PosePredictor:
                     "that one"
                 )
         state = next(state for state in reversed(states) if state.time_ns <= time_ns)
-        R, p, v = _moved(state, min((time_ns - state.time_ns) * S_PER_NS, _LONGEST_STEP_S))
+        R, p, v = _moved(state, min((time_ns - state.time_ns) * S_PER_NS, _PREDICTION.max_step_s))
         return PredictedPose(time_ns, se3_from_parts(R, p), v)
 
     def _motion_of(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from vio.live.frame_pipeline import FramePipeline
 from vio.records import Estimate, Event, FrameResult, MotionSample, StereoFrame
@@ -18,7 +18,17 @@ if TYPE_CHECKING:
 
 # a frame waits until one that is so much newer has come: then the IMU is silent
 LONGEST_WAIT_NS = 100_000_000
-_MAX_SAMPLES = 100_000  # that wait: minutes in which no frame came
+
+
+class _WaitRules(NamedTuple):
+    """How long a frame waits for samples."""
+
+    max_samples: int = 100_000  # that wait: minutes in which no frame came
+    min_s: float = 1e-3  # a velocity carries the pose that far as well as the IMU does
+    clear_sigmas: float = 3.0  # standard deviations of a time offset that is waited for
+
+
+_WAIT = _WaitRules()
 
 
 class EventOrder:
@@ -37,7 +47,7 @@ class EventOrder:
         """
         self._wait = wait_for_imu
         self._frames: deque[StereoFrame] = deque()
-        self._samples: deque[MotionSample] = deque(maxlen=_MAX_SAMPLES)
+        self._samples: deque[MotionSample] = deque(maxlen=_WAIT.max_samples)
         self._newest_ns: int | None = None  # sample that has come
         self._released_ns: int | None = None  # newest sample that was released
         # from a frame's stamp to its exposure on the IMU's clock, 0 or more, as estimated
@@ -99,17 +109,17 @@ class EventOrder:
         return frame.time_ns + self.exposed_after_ns
 
 
-_MIN_WAIT_S = 1e-3  # a velocity carries the pose that far as well as the IMU does
-_CLEAR = 3.0  # standard deviations of a time offset that is waited for
-
-
 def _wait_ns(estimate: Estimate) -> int:
     """How long after its stamp a frame is processed, ns, so that the IMU's samples reach its
     exposure.
     """
     offset_s = estimate.time_offset_s
     sigma_s = estimate.time_offset_sigma_s
-    if offset_s is None or sigma_s is None or offset_s < max(_MIN_WAIT_S, _CLEAR * sigma_s):
+    if (
+        offset_s is None
+        or sigma_s is None
+        or offset_s < max(_WAIT.min_s, _WAIT.clear_sigmas * sigma_s)
+    ):
         return 0
     return round(1e9 * offset_s)
 

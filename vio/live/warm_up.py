@@ -9,6 +9,7 @@ import logging
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,14 +20,21 @@ from vio.geometry.stereo import StereoCamera
 from vio.live.odometry import Odometry
 from vio.records import Image
 
-_FRAMES = 40  # samples a frame
-_STEP_NS = 50_000_000
-_SAMPLES = 10
-_FAR_PX = 12.0  # disparities of the upper and the lower half of the images
-_NEAR_PX = 24.0
-_SWAY_PX = 60.0  # of the near half, and its period
-_SWAY_S = 2.0
-_SMOOTH_PX = 1.5
+
+class _MadeUpRun(NamedTuple):
+    """The images and samples that are made up."""
+
+    frames: int = 40  # samples a frame
+    step_ns: int = 50_000_000
+    samples_per_frame: int = 10
+    far_px: float = 12.0  # disparities of the upper and the lower half of the images
+    near_px: float = 24.0
+    sway_px: float = 60.0  # of the near half, and its period
+    sway_s: float = 2.0
+    smooth_px: float = 1.5
+
+
+_RUN = _MadeUpRun()
 
 
 def warm_up(
@@ -70,10 +78,10 @@ def _configs(config: Config) -> list[Config]:
 def sway(odometry: Odometry, config: Config) -> None:
     """Give an odometry the images and motion samples of two seconds."""
     source = SwayingCamera(odometry.camera, odometry.T_cam0_body, config.imu.gravity_mps2)
-    for frame in range(_FRAMES):
-        time_ns = frame * _STEP_NS
-        for k in range(1 - _SAMPLES, 1):
-            sample_ns = time_ns + k * _STEP_NS // _SAMPLES
+    for frame in range(_RUN.frames):
+        time_ns = frame * _RUN.step_ns
+        for k in range(1 - _RUN.samples_per_frame, 1):
+            sample_ns = time_ns + k * _RUN.step_ns // _RUN.samples_per_frame
             if odometry.motion == "imu":
                 odometry.add_imu(sample_ns, *source.imu(sample_ns))
             elif odometry.motion == "velocity":
@@ -104,15 +112,15 @@ class SwayingCamera:
         self._size = camera.width, camera.height
         rows = camera.height // 2
         # A single camera's baseline is 1 m or made up: its walls are at some metres.
-        far_m = camera.fu * camera.baseline_m / _FAR_PX if camera.kind == "stereo" else 4.0
+        far_m = camera.fu * camera.baseline_m / _RUN.far_px if camera.kind == "stereo" else 4.0
         self._px_per_m = np.array([1.0, 2.0]) * camera.fu / far_m
-        self._sway_m = _SWAY_PX / self._px_per_m[1]
+        self._sway_m = _RUN.sway_px / self._px_per_m[1]
         self._depth_m: FloatArray = np.full((camera.height, camera.width), far_m)
         self._depth_m[rows:] /= 2.0
         noise = np.random.default_rng(0).normal(
-            size=(camera.height, camera.width + 4 * int(_SWAY_PX + _NEAR_PX))
+            size=(camera.height, camera.width + 4 * int(_RUN.sway_px + _RUN.near_px))
         )
-        smooth = cv2.GaussianBlur(noise, (0, 0), _SMOOTH_PX)
+        smooth = cv2.GaussianBlur(noise, (0, 0), _RUN.smooth_px)
         self._texture = np.clip(128.0 + 40.0 * smooth / smooth.std(), 0, 255).astype(np.uint8)
         self._rows = slice(0, rows), slice(rows, camera.height)
 
@@ -140,7 +148,7 @@ class SwayingCamera:
         """
         if time_s < 0:
             return 0.0, 0.0, 0.0
-        rate = 2.0 * np.pi / _SWAY_S
+        rate = 2.0 * np.pi / _RUN.sway_s
         phase = rate * time_s
         a = 0.5 * self._sway_m
         return a * (1 - np.cos(phase)), a * rate * np.sin(phase), a * rate**2 * np.cos(phase)
@@ -151,7 +159,7 @@ class SwayingCamera:
 
         out = np.empty(self._size[::-1], dtype=np.uint8)
         for rows, px_per_m in zip(self._rows, self._px_per_m.tolist(), strict=True):
-            shift = np.array([[1.0, 0.0, -(px_per_m * x_m + _NEAR_PX)], [0.0, 1.0, 0.0]])
+            shift = np.array([[1.0, 0.0, -(px_per_m * x_m + _RUN.near_px)], [0.0, 1.0, 0.0]])
             size = self._size[0], rows.stop - rows.start
             out[rows] = cv2.warpAffine(self._texture[rows], shift, size, flags=cv2.INTER_LINEAR)
         return out

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,16 +28,33 @@ from vio.records import BoolArray, LoopEvent
 log = logging.getLogger(__name__)
 
 CONFIRM_WITHIN = 6  # keyframes
-# path between two places up to which the map's own drift between them is counted
-_NEIGHBOURS_M = 50.0
-# squared error of a new loop, its expected value, up to which the optimisation can wait …
-_SETTLED = 6.0
-_PATIENCE = 8  # … for so many loops
-_COMMIT_EVERY = 20  # keyframes
+
+
+class _SettlingRules(NamedTuple):
+    """When new loops are optimised and stored."""
+
+    # path between two places up to which the map's own drift between them is counted
+    neighbours_m: float = 50.0
+    # squared error of a new loop, its expected value, up to which the optimisation can wait …
+    settled_error: float = 6.0
+    waiting_loops: int = 8  # … for so many loops
+    commit_keyframes: int = 20  # keyframes
+
+
+_SETTLING = _SettlingRules()
 _ONLY = ("pinhole", "stereo")  # projection and kind of the cameras that maps know
-_SAME_RIG = 0.03  # by which two calibrations of one rig may differ in focal length and baseline
-# by which a rectification error moves the pixels of a keyframe before all are corrected anew
-_FIELD_MOVED_PX = 0.02
+
+
+class _RigRules(NamedTuple):
+    """When a rig is that of the map."""
+
+    # by which two calibrations of one rig may differ in focal length and baseline
+    max_difference: float = 0.03
+    # by which a rectification error moves the pixels of a keyframe before all are corrected anew
+    field_moved_px: float = 0.02
+
+
+_RIG = _RigRules()
 _OF_THE_FILE = ("_store", "_stored_poses", "_stored_kept")
 
 
@@ -76,7 +93,7 @@ def _is_alike(a: StereoCamera, b: StereoCamera) -> bool:
     """Whether two cameras may be one rig with two calibrations."""
     lengths, others = ((c.fu, c.fv, c.baseline_m) for c in (a, b))
     return (a.width, a.height) == (b.width, b.height) and np.allclose(
-        lengths, others, rtol=_SAME_RIG, atol=0
+        lengths, others, rtol=_RIG.max_difference, atol=0
     )
 
 
@@ -222,7 +239,7 @@ class MapBuilder:
         if not self._localise:
             self.places.remember(self._camera, features)
             self._forget(graph.part == graph.part[number], np.floor(graph.T_map_cam[number][:3, 3]))
-            if number % _COMMIT_EVERY == 0:
+            if number % _SETTLING.commit_keyframes == 0:
                 self.commit()
         return self._update(events, keyframe.rig_sigmas)
 
@@ -303,7 +320,7 @@ class MapBuilder:
         before = sessions[own].field
         if before is not None and features is not None:
             moved = (field.at(features.z) - before.at(features.z))[features.has_right]
-            if not len(moved) or np.sqrt(np.mean(moved**2)) < _FIELD_MOVED_PX:
+            if not len(moved) or np.sqrt(np.mean(moved**2)) < _RIG.field_moved_px:
                 return
         sessions[own] = replace(sessions[own], field=field)
         self.places.forget_pixels()
@@ -419,8 +436,8 @@ class MapBuilder:
         self.places.newest = row
         self._moved = True
         self._waiting += 1
-        settled = self._optimised and squared(r, pose.covariance) <= _SETTLED
-        if joined or not settled or self._waiting >= _PATIENCE:
+        settled = self._optimised and squared(r, pose.covariance) <= _SETTLING.settled_error
+        if joined or not settled or self._waiting >= _SETTLING.waiting_loops:
             self._optimise()
         return LoopEvent(
             frame=graph.frame(k),
@@ -473,7 +490,7 @@ def agree(graph: MapGraph, a: FoundPlace, b: FoundPlace) -> bool:
     A = se3_adjoint(se3_inverse(T_second))
     C = A @ a.seen.pose.covariance @ A.T + b.seen.pose.covariance
     C = C + graph.drift(np.array([a.second]), np.array([b.second]))[0]
-    if abs(graph.path_m[a.first] - graph.path_m[b.first]) < _NEIGHBOURS_M:
+    if abs(graph.path_m[a.first] - graph.path_m[b.first]) < _SETTLING.neighbours_m:
         C = C + graph.drift(np.array([a.first]), np.array([b.first]))[0]
     return squared(r, C) < GATE
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -45,12 +45,20 @@ class _Extraction:
 
 
 _EXTRACTION = _Extraction()
-_CELLS = 10  # along the larger side of the image
-_LEVELS = 8  # pyramid of the detector: up to 3.6 times nearer
-_SCALE = 1.2
-_MAX_DISPARITY = 0.4  # of the width
-_MIN_DISPARITY_PX = 0.5
-_MAX_BITS = 64  # in which the descriptors of one point differ: a quarter
+
+
+class _KeyPointRules(NamedTuple):
+    """Which key points a keyframe keeps."""
+
+    cells: int = 10  # along the larger side of the image
+    levels: int = 8  # pyramid of the detector: up to 3.6 times nearer
+    scale: float = 1.2
+    max_disparity_share: float = 0.4  # of the width
+    min_disparity_px: float = 0.5
+    max_bits: int = 64  # in which the descriptors of one point differ: a quarter
+
+
+_KEY_POINTS = _KeyPointRules()
 # bits of a byte
 _ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint16)
 
@@ -99,7 +107,10 @@ def extract(left: Image, right: Image, *, most: int = MAX_FEATURES) -> KeyframeF
     right one.
     """
     orb = cv2.ORB.create(
-        _EXTRACTION.detected * most, _SCALE, _LEVELS, fastThreshold=_EXTRACTION.corner_contrast
+        _EXTRACTION.detected * most,
+        _KEY_POINTS.scale,
+        _KEY_POINTS.levels,
+        fastThreshold=_EXTRACTION.corner_contrast,
     )
     found = orb.detect(left, None)
     if not found:
@@ -110,7 +121,7 @@ def extract(left: Image, right: Image, *, most: int = MAX_FEATURES) -> KeyframeF
         return no_keyframe_features()
     bits = np.asarray(described, dtype=np.uint8)
     uv = np.array([p.pt for p in points], dtype=np.float64)
-    scale = np.array([_SCALE**p.octave for p in points])
+    scale = np.array([_KEY_POINTS.scale**p.octave for p in points])
     order = np.lexsort((uv[:, 1], uv[:, 0]))  # OpenCV's own order is that of the levels
     uv = uv[order]
     scale = scale[order]
@@ -130,8 +141,8 @@ def _spread(
     """
     uv = np.array([p.pt for p in found])
     strength = np.array([p.response for p in found])
-    cell = (uv // (max(shape) / _CELLS)).astype(np.int64)
-    code = cell[:, 1] * _CELLS + cell[:, 0]
+    cell = (uv // (max(shape) / _KEY_POINTS.cells)).astype(np.int64)
+    code = cell[:, 1] * _KEY_POINTS.cells + cell[:, 0]
     order = np.lexsort((uv[:, 1], uv[:, 0], -strength, code))
     begins = np.flatnonzero(np.diff(code[order], prepend=-1))
     rank = np.arange(len(order)) - np.repeat(begins, np.diff(begins, append=len(order)))
@@ -154,11 +165,11 @@ def _right_pixels(
     if there_bits is None:
         return out, valid
     at = np.array([p.pt for p in there])
-    size = np.array([_SCALE**p.octave for p in there])
+    size = np.array([_KEY_POINTS.scale**p.octave for p in there])
     i, j = _near_rows(uv[:, 1], at[:, 1], _EXTRACTION.rows_px * scale)
     shift = uv[i, 0] - at[j, 0]
-    allowed = (shift > -1.0) & (shift < _MAX_DISPARITY * left.shape[1])
-    allowed &= np.abs(np.log(scale[i] / size[j])) < 1.5 * np.log(_SCALE)
+    allowed = (shift > -1.0) & (shift < _KEY_POINTS.max_disparity_share * left.shape[1])
+    allowed &= np.abs(np.log(scale[i] / size[j])) < 1.5 * np.log(_KEY_POINTS.scale)
     rows, best = _most_alike(i[allowed], j[allowed], bits, np.asarray(there_bits, dtype=np.uint8))
     if not len(rows):
         return out, valid
@@ -175,7 +186,7 @@ def _right_pixels(
     found = refined[:, 0].astype(np.float64)
     good = (status[:, 0] > 0) & (np.abs(found[:, 1] - uv[rows, 1]) <= _EXTRACTION.lk_rows_px)
     good &= np.abs(found[:, 0] - start[:, 0, 0]) <= _EXTRACTION.rows_px * scale[rows]
-    good &= uv[rows, 0] - found[:, 0] >= _MIN_DISPARITY_PX
+    good &= uv[rows, 0] - found[:, 0] >= _KEY_POINTS.min_disparity_px
     out[rows[good]] = found[good]
     valid[rows[good]] = True
     return out, valid
@@ -200,7 +211,7 @@ def _most_alike(i: IntArray, j: IntArray, a: Bits, b: Bits) -> tuple[IntArray, I
     order = np.lexsort((j, differing, i))
     rows, first = np.unique(i[order], return_index=True)
     best = order[first]
-    good = differing[best] <= _MAX_BITS
+    good = differing[best] <= _KEY_POINTS.max_bits
     return rows[good], j[best[good]]
 
 

@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -47,8 +47,17 @@ KEYS = {
     "earth": "id",
 }
 _ROTATION_TOLERANCE = 1e-3  # of R R^T
-_MAX_S = 300.0  # of one step with the file
-_STEP = 10_000  # instructions of SQLite between two looks at the clock, and at signals
+
+
+class _StepLimits(NamedTuple):
+    """How long one step with the file may take."""
+
+    max_s: float = 300.0  # of one step with the file
+    # instructions of SQLite between two looks at the clock, and at signals
+    instructions_per_look: int = 10_000
+
+
+_LIMITS = _StepLimits()
 APPLICATION_ID = 0x53564D50  # "SVMP" in the file's header
 _SCHEMA = """
 CREATE TABLE sessions (id INTEGER PRIMARY KEY, source TEXT NOT NULL, part INTEGER NOT NULL, upright INTEGER NOT NULL,
@@ -150,7 +159,7 @@ class MapDatabase(ABC):
             undo.callback(self._db.close)
             self._db.isolation_level = None
             self._db.create_function("row_crc32", -1, _row_crc32, deterministic=True)
-            self._db.set_progress_handler(self._is_late, _STEP)
+            self._db.set_progress_handler(self._is_late, _LIMITS.instructions_per_look)
             empty = not self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
             if empty and create:
                 self._db.executescript(
@@ -234,7 +243,7 @@ class MapDatabase(ABC):
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
-        self._end_s = time.monotonic() + _MAX_S
+        self._end_s = time.monotonic() + _LIMITS.max_s
         with _errors_of(self.path):
             try:
                 yield
@@ -242,7 +251,7 @@ class MapDatabase(ABC):
                 if not self._is_late():
                     raise
                 raise DataError(
-                    f"{self.path}: a step took more than {_MAX_S:.0f} s; build the map again"
+                    f"{self.path}: a step took more than {_LIMITS.max_s:.0f} s; build the map again"
                 ) from error
 
     def _is_late(self) -> bool:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,21 +26,37 @@ from vio.records import BoolArray, IntArray
 Words = npt.NDArray[np.uint16]
 Owners = npt.NDArray[np.unsignedinteger[Any]]
 
-_TABLES = 4  # 4 x 16384 words; a keyframe of 600 features has 2400 of them in 5 kB
-_BITS = 14
-_WORDS = 1 << _BITS
-_SEED = 20120617  # of the choice of bits: any, but the same in all maps
+
+class _WordRules(NamedTuple):
+    """How words are made of descriptors."""
+
+    tables: int = 4  # 4 x 16384 words; a keyframe of 600 features has 2400 of them in 5 kB
+    bits: int = 14
+    seed: int = 20120617  # of the choice of bits: any, but the same in all maps
+
+
+_WORD_RULES = _WordRules()
+_WORDS = 1 << _WORD_RULES.bits
 # keyframes before and after a candidate whose scores are added to its own: they show the same place
 _NEIGHBOURS = 2
-_MIN_TAIL = 32  # keyframes; a merge takes as long as the comparison with ten times as many
-_TAIL_SHARE = 1 / 16
+
+
+class _TailRules(NamedTuple):
+    """Keyframes that are compared without the index."""
+
+    # keyframes; a merge takes as long as the comparison with ten times as many
+    min_keyframes: int = 32
+    share: float = 1 / 16
+
+
+_TAIL = _TailRules()
 _UNIT = 1 << 16  # of the weights
 SEGMENT = 256  # keyframes whose words a file keeps in the order of the index
 
 
 def words_of(descriptors: Bits) -> Words:
     """Return the words (T, N) of descriptors (N, 32), one row a table."""
-    out = np.zeros((_TABLES, len(descriptors)), dtype=np.uint16)
+    out = np.zeros((_WORD_RULES.tables, len(descriptors)), dtype=np.uint16)
     _write_words(np.ascontiguousarray(descriptors), _chosen_bits(), out)
     return out
 
@@ -48,8 +64,10 @@ def words_of(descriptors: Bits) -> Words:
 @cache
 def _chosen_bits() -> IntArray:
     """Return the bits (T, B) of each table's words."""
-    chosen = np.random.default_rng(_SEED).permutation(8 * DESCRIPTOR_BYTES)[: _TABLES * _BITS]
-    return chosen.reshape(_TABLES, _BITS).astype(np.int64)
+    chosen = np.random.default_rng(_WORD_RULES.seed).permutation(8 * DESCRIPTOR_BYTES)[
+        : _WORD_RULES.tables * _WORD_RULES.bits
+    ]
+    return chosen.reshape(_WORD_RULES.tables, _WORD_RULES.bits).astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +84,8 @@ class Segment:
         Raises:
             ValueError: they are not those of an index.
         """
-        begins = begins.reshape(_TABLES, _WORDS + 1)
-        owners = owners.reshape(_TABLES, -1)
+        begins = begins.reshape(_WORD_RULES.tables, _WORDS + 1)
+        owners = owners.reshape(_WORD_RULES.tables, -1)
         ends = begins[:, [0, -1]] == (0, owners.shape[1])
         if not ends.all() or (begins[:, 1:] < begins[:, :-1]).any():
             raise ValueError("its words are not in order")
@@ -84,15 +102,17 @@ class PlaceIndex:
 
     def __init__(self) -> None:
         # of each word among the owners
-        self._begins: IntArray = np.zeros((_TABLES, _WORDS + 1), dtype=np.int64)
-        self._owners: Owners = np.zeros((_TABLES, 0), dtype=np.uint16)  # keyframes, ordered by word
+        self._begins: IntArray = np.zeros((_WORD_RULES.tables, _WORDS + 1), dtype=np.int64)
+        self._owners: Owners = np.zeros(
+            (_WORD_RULES.tables, 0), dtype=np.uint16
+        )  # keyframes, ordered by word
         self._merged = 0  # keyframes in the index; the others are the tail
         self._tail: list[Words] = []
         self._sizes: list[int] = []  # features of each keyframe
         # keyframe that showed a word last, from 1
-        self._newest: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)
+        self._newest: IntArray = np.zeros((_WORD_RULES.tables, _WORDS), dtype=np.int64)
         # keyframes with a word
-        self._frequency: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)
+        self._frequency: IntArray = np.zeros((_WORD_RULES.tables, _WORDS), dtype=np.int64)
         self._unsaved: list[Words] = []  # of the keyframes since the last full segment
 
     def __len__(self) -> int:
@@ -111,7 +131,7 @@ class PlaceIndex:
         self._unsaved.append(words)
         self._sizes.append(words.shape[1])
         _count_words(words, self._newest, len(self._sizes), self._frequency)
-        if len(self._tail) >= max(_MIN_TAIL, int(_TAIL_SHARE * len(self))):
+        if len(self._tail) >= max(_TAIL.min_keyframes, int(_TAIL.share * len(self))):
             self._merge()
 
     def restore(self, segments: Sequence[Segment]) -> None:
@@ -137,7 +157,7 @@ class PlaceIndex:
         words, offsets = _joined(self._unsaved)
         begins = np.zeros_like(self._begins)
         owners = np.empty(words.shape, dtype=np.uint16)
-        nothing = np.zeros((_TABLES, 0), dtype=np.uint16)
+        nothing = np.zeros((_WORD_RULES.tables, 0), dtype=np.uint16)
         _merge_words(
             np.zeros_like(begins), nothing, words, offsets, int(np.int64(0)), begins, owners
         )
@@ -147,7 +167,7 @@ class PlaceIndex:
     def _room(self, size: int) -> Owners:
         count = max(len(self), self._merged)
         kind = np.min_scalar_type(count) if count > np.iinfo(np.uint16).max else np.dtype(np.uint16)
-        return np.empty((_TABLES, size), dtype=kind)
+        return np.empty((_WORD_RULES.tables, size), dtype=kind)
 
     def _merge(self) -> None:
         words, offsets = _joined(self._tail)
@@ -164,7 +184,7 @@ class PlaceIndex:
         (N, 32).
         """
         count = len(self)
-        weight = np.zeros((_TABLES, _WORDS), dtype=np.int64)
+        weight = np.zeros((_WORD_RULES.tables, _WORDS), dtype=np.int64)
         known = [np.unique(row).astype(np.int64) for row in words_of(descriptors)]
         for table, row in enumerate(known):
             logs = np.log((count + 1.0) / (self._frequency[table, row] + 1.0))
@@ -197,7 +217,7 @@ class PlaceIndex:
 
 def _joined(parts: Sequence[npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], IntArray]:
     """Return the words or owners (T, N) of all parts, and where those of each begin (K + 1,)."""
-    nothing = np.zeros((_TABLES, 0), dtype=np.uint16)
+    nothing = np.zeros((_WORD_RULES.tables, 0), dtype=np.uint16)
     return np.concatenate(parts or [nothing], axis=1), np.cumsum(
         [0, *(part.shape[1] for part in parts)]
     )

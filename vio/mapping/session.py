@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -36,7 +36,17 @@ from vio.records import (
 _T = TypeVar("_T")
 Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
 
-_SHARED = 0.6  # of the last keyframe's features that are still seen: below it, a new keyframe
+
+class _KeyframeRules(NamedTuple):
+    """When a frame becomes a keyframe."""
+
+    # of the last keyframe's features that are still seen: below it, a new keyframe
+    max_shared_share: float = 0.6
+    # keyframes without a result, where the odometry waits for none: beyond, the next one comes later
+    max_waiting: int = 3
+
+
+_KEYFRAMES = _KeyframeRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +75,6 @@ class _Choice:
 
 
 _CHOICE = _Choice()
-# keyframes without a result, where the odometry waits for none: beyond, the next one comes later
-_MAX_WAITING = 3
 HANDOVER_FRAMES = 10  # from a keyframe to the frame at which its result is taken over
 # from a keyframe to the frame after which its motion is no longer corrected by the window
 SETTLED_FRAMES = 3
@@ -215,7 +223,7 @@ class MapSession:
         self._since += 1
         if motion is None and self._newest is not None:
             return events
-        busy = not self._wait and len(self._waiting) + len(self._held) >= _MAX_WAITING
+        busy = not self._wait and len(self._waiting) + len(self._held) >= _KEYFRAMES.max_waiting
         if not busy and self._is_due(fresh.ids, motion):
             self._hold(frame, fresh.ids, estimate, motion)
         return events
@@ -391,7 +399,7 @@ class MapSession:
             lost = covariance is None or covariance[:3, :3].trace() > _CHOICE.lost_m**2
             if lost or self._since >= _CHOICE.localise_step:
                 return True
-        return bool(np.isin(self._ids, ids).mean() < _SHARED)
+        return bool(np.isin(self._ids, ids).mean() < _KEYFRAMES.max_shared_share)
 
     def _hold(
         self, frame: StereoFrame, ids: IntArray, estimate: Estimate, motion: RelativePose | None

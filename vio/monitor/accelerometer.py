@@ -7,6 +7,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from itertools import permutations, product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,16 +27,32 @@ from vio.records import S_PER_NS
 
 log = logging.getLogger(__name__)
 
-_SIGN_SIGMAS = 6.0
+
+class _AxesRules(NamedTuple):
+    """When axes or signs of the accelerometer are others."""
+
+    sign_sigmas: float = 6.0
+    # likewise in fewer windows; right axes came to at most 1.2 in 178 pieces of flights and drives
+    worse_early: float = 9.0
+    upside_down_cosine: float = 0.5  # cosine between image-down and up: within 60 degrees
+    upside_down_share: float = 0.95
+
+
+_AXES = _AxesRules()
 AXES_WORSE = 3.0  # ratio of the given axes' squared misfit to that of others
-# likewise in fewer windows; right axes came to at most 1.2 in 178 pieces of flights and drives
-_AXES_WORSE_EARLY = 9.0
-# Factor on the camera's motion from which on it is judged here; smaller ones are estimated while
-# running. Of right baselines it came to 0.96 to 1.11 in windows of 4 s and more of two flights.
-_OTHER_SCALE = 3.0
-_SCALE_EXPLAINS = 4.0  # of the camera's squared path, which the scaled readings leave a part of
-_UPSIDE_DOWN = 0.5  # cosine between image-down and up: within 60 degrees
-_UPSIDE_SHARE = 0.95
+
+
+class _OtherScale(NamedTuple):
+    """When the camera's motion is of another scale than the readings."""
+
+    # Factor on the camera's motion from which on it is judged here; smaller ones are estimated while
+    # running. Of right baselines it came to 0.96 to 1.11 in windows of 4 s and more of two flights.
+    min_factor: float = 3.0
+    # of the camera's squared path, which the scaled readings leave a part of
+    explained_ratio: float = 4.0
+
+
+_OTHER = _OtherScale()
 
 
 def signed_permutations() -> Iterator[FloatArray]:
@@ -67,7 +84,7 @@ def resolve_size(size: Size, evidence: Evidence) -> Size:
         return size
     if evidence.force is not None:
         scale, sigma = evidence.force.sign(evidence.R_cam0_imu)
-        if 0 < scale < 0.5 * size.unit - _SIGN_SIGMAS * sigma:
+        if 0 < scale < 0.5 * size.unit - _AXES.sign_sigmas * sigma:
             seen = f"{size.finding.seen}, though the images' accelerations are only {scale:.2f} times its own"
             return Size(gravity_removed(seen), None)
     return size if evidence.force_final else Size(None, size.unit)
@@ -93,7 +110,7 @@ def judge_force(
                 return [scaled], True
     if force is not None:
         scale, sigma = force.sign(R * unit)
-        if abs(scale) > _SIGN_SIGMAS * sigma and 0.5 < abs(scale) < 2.0:
+        if abs(scale) > _AXES.sign_sigmas * sigma and 0.5 < abs(scale) < 2.0:
             return (
                 [_wrong_sign(scale, sigma)] if scale < 0 else judge_up(readings, R, measured=True)
             ), True
@@ -119,10 +136,10 @@ def _wrong_scale(force: ForceFit, C: FloatArray, camera: StereoCamera) -> Inerti
     if camera.kind == "mono":
         return None
     scale, sigma = force.sign(C)
-    if scale < _OTHER_SCALE or scale < _SIGN_SIGMAS * sigma:
+    if scale < _OTHER.min_factor or scale < _AXES.sign_sigmas * sigma:
         return None
     best = force.cost(scale * C)
-    if best * AXES_WORSE > force.cost(C) or best * _SCALE_EXPLAINS > force.cost(0 * C):
+    if best * AXES_WORSE > force.cost(C) or best * _OTHER.explained_ratio > force.cost(0 * C):
         return None
     seen = (
         f"the camera's accelerations are {scale:.3g} times (standard deviation {sigma:.2g}) those "
@@ -148,7 +165,7 @@ def _wrong_axes(force: ForceFit, C: FloatArray) -> InertialFinding | None:
     others = [P for P in signed_permutations() if abs(np.trace(P)) < 2.5]
     costs = [force.cost(C @ P) for P in others]
     k = int(np.argmin(costs))
-    worse = AXES_WORSE if force.windows >= MIN_WINDOWS else _AXES_WORSE_EARLY
+    worse = AXES_WORSE if force.windows >= MIN_WINDOWS else _AXES.worse_early
     # Neither the given axes nor their negative may explain the readings: the sign is judged
     # separately.
     if costs[k] * worse > min(given, force.cost(-C)):
@@ -173,8 +190,8 @@ def judge_up(force: FloatArray, R_cam0_imu: FloatArray, *, measured: bool) -> li
     """
     up = force @ R_cam0_imu.T
     down_in_image = up[:, 1] / np.maximum(np.linalg.norm(up, axis=1), 1e-9)
-    share = float(np.mean(down_in_image > _UPSIDE_DOWN)) if len(up) else 0.0
-    if share < _UPSIDE_SHARE:
+    share = float(np.mean(down_in_image > _AXES.upside_down_cosine)) if len(up) else 0.0
+    if share < _AXES.upside_down_share:
         return []
     explanation = (
         "the camera is mounted upside down, or gravity was added with the wrong sign (a + g in "

@@ -10,19 +10,27 @@ shock or an object that moves makes single frames stand out.
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
 from vio.findings import Finding
 from vio.numerics.robust import median
 
-_CONTRADICTED = 4.0  # median innovation over its standard deviation
-_FRAMES = 24  # the newest, of which …
-# … so many are contradicted. Healthy ones come to 13 of 24 where a flight begins with vibrations
-# that the stated noise lacks and the filter learns (images rendered along MH_03, its real IMU:
-# 7 of the first 8, ATE 0.3 mm); clocks 0.1 s off and an IMU turned by 18 degrees to 21 and more.
-_MIN_CONTRADICTED = 20
-_QUIET_FRAMES = 20  # in a row without one, after which IMU and images agree again
+
+class _ContradictionRules(NamedTuple):
+    """When motion sensor and images contradict each other."""
+
+    min_sigmas: float = 4.0  # median innovation over its standard deviation
+    newest_frames: int = 24  # the newest, of which …
+    # … so many are contradicted. Healthy ones come to 13 of 24 where a flight begins with vibrations
+    # that the stated noise lacks and the filter learns (images rendered along MH_03, its real IMU:
+    # 7 of the first 8, ATE 0.3 mm); clocks 0.1 s off and an IMU turned by 18 degrees to 21 and more.
+    min_frames: int = 20
+    quiet_frames: int = 20  # in a row without one, after which IMU and images agree again
+
+
+_CONTRADICTION = _ContradictionRules()
 _CODE = "imu-disagrees"
 
 
@@ -30,7 +38,9 @@ class ImuContradiction:
     """Reports once per event that the images contradict the motion by the IMU."""
 
     def __init__(self) -> None:
-        self._ratios = deque[tuple[int, float]](maxlen=_FRAMES)  # with the numbers of the frames
+        self._ratios = deque[tuple[int, float]](
+            maxlen=_CONTRADICTION.newest_frames
+        )  # with the numbers of the frames
         self._quiet = 0  # frames in a row
         self._reported = False
 
@@ -44,12 +54,12 @@ class ImuContradiction:
         if innovation_ratio is None:
             return []
         self._ratios.append((index, innovation_ratio))
-        is_off = innovation_ratio > _CONTRADICTED
+        is_off = innovation_ratio > _CONTRADICTION.min_sigmas
         self._quiet = 0 if is_off else self._quiet + 1
         if self._reported:
-            return self.end(index) if self._quiet >= _QUIET_FRAMES else []
-        off = [(frame, ratio) for frame, ratio in self._ratios if ratio > _CONTRADICTED]
-        if len(off) < _MIN_CONTRADICTED:
+            return self.end(index) if self._quiet >= _CONTRADICTION.quiet_frames else []
+        off = [(frame, ratio) for frame, ratio in self._ratios if ratio > _CONTRADICTION.min_sigmas]
+        if len(off) < _CONTRADICTION.min_frames:
             return []
         self._reported = True
         ratio = median(np.array([ratio for _, ratio in off]))

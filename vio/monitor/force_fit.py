@@ -5,6 +5,7 @@ accelerations, (I3).
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,15 +20,23 @@ from vio.records import BoolArray
 FIRST_EVALUATION = 60
 WINDOW_S = 2.0
 MIN_WINDOWS = 3  # for all but axes that are clearly wrong
-_FEWEST_WINDOWS = 2
-_BIAS_PRIOR_MPS2 = 0.3
-_LEVER_ARM_PRIOR_M = 1.0
-_MISFIT_M = 0.02  # standard deviation of a window's positions, to weight the priors
+
+
+class _FitPriors(NamedTuple):
+    """What is known of the map from readings to accelerations."""
+
+    min_windows: int = 2
+    bias_mps2: float = 0.3
+    lever_arm_m: float = 1.0
+    misfit_m: float = 0.02  # standard deviation of a window's positions, to weight the priors
+    reweightings: int = 4
+
+
+_PRIORS = _FitPriors()
 # information, (6,)
-_PRIOR = _MISFIT_M**2 / np.repeat([_BIAS_PRIOR_MPS2, _LEVER_ARM_PRIOR_M], 3) ** 2
+_PRIOR = _PRIORS.misfit_m**2 / np.repeat([_PRIORS.bias_mps2, _PRIORS.lever_arm_m], 3) ** 2
 # information on the map's entries, (9,): keeps the fit solvable
-_MAP_PRIOR = np.full(9, _MISFIT_M**2 / 400)
-_REWEIGHTINGS = 4
+_MAP_PRIOR = np.full(9, _PRIORS.misfit_m**2 / 400)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +127,12 @@ def fit_force(record: Record, gyro_fit: GyroFit, lever_arm: FloatArray) -> Force
     given position of the IMU in cam0, `lever_arm` (3,) in metres, is fitted, too.
     """
     blocks = [_normal_equations(window, lever_arm) for window in _windows(record, gyro_fit)]
-    if len(blocks) < _FEWEST_WINDOWS:
+    if len(blocks) < _PRIORS.min_windows:
         return None
     N, h, c = (np.array([b[k] for b in blocks]) for k in range(3))
     weight: FloatArray = np.ones(len(blocks))
     prior = np.diag(np.concatenate([_MAP_PRIOR, _PRIOR]))
-    for _ in range(_REWEIGHTINGS):
+    for _ in range(_PRIORS.reweightings):
         x = np.linalg.solve(np.tensordot(weight, N, 1) + prior, weight @ h)
         misfit = np.maximum(c - 2 * h @ x + np.einsum("i,wij,j->w", x, N, x), 0)
         weight = 1 / (1 + misfit / max(4 * float(np.median(misfit)), 1e-9)) ** 2

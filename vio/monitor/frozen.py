@@ -13,6 +13,7 @@ prediction agrees, and they are used.
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,28 +37,54 @@ from vio.records import (
 )
 
 _RADIUS = 4  # of the patches whose flow is measured, pixels
-_CORNERS = 60  # measured per image
-_MIN_CORNERS = 15
-_PREDICTED_PX = 1.0  # a corner that is predicted to move less is no evidence …
-_ERRORS = 3.0  # … nor one that moves by less than so many times what predictions were off by …
-_RECENT = 20  # … at most in so many frames
-_MIN_RECENT = 5
-# flow between the two frames before (median), beyond which no rig stands still at once
-_MOVED_PX = 0.3
-# Equal images that were taken for a standstill are ended by a motion that begins. One that is there
-# at once, beyond so many pixels and times the flow before, or loses so many features, has gone on
-# unseen.
-_BEGUN_PX = 3.0
-_BEGUN_FACTOR = 10.0
-_BEGUN_SHARE = 0.2
-_UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
-_SHARE = 0.8  # of the corners that must be unmoved
-_FIRST_ROWS = 8  # compared before all others
+
+
+class _FlowRules(NamedTuple):
+    """When images show no motion although the rig moves."""
+
+    corners: int = 60  # measured per image
+    min_corners: int = 15
+    min_predicted_px: float = 1.0  # a corner that is predicted to move less is no evidence …
+    # … nor one that moves by less than so many times what predictions were off by …
+    prediction_errors: float = 3.0
+    recent_frames: int = 20  # … at most in so many frames
+    min_recent_frames: int = 5
+    # flow between the two frames before (median), beyond which no rig stands still at once
+    moved_px: float = 0.3
+    unmoved_px: float = 0.15  # the flow of an unmoved corner under noise of a few gray levels
+    unmoved_share: float = 0.8  # of the corners that must be unmoved
+    first_rows: int = 8  # compared before all others
+
+
+_FLOW = _FlowRules()
+
+
+class _BegunRules(NamedTuple):
+    """When a motion has begun during images that were taken for a standstill."""
+
+    # Equal images that were taken for a standstill are ended by a motion that begins. One that is there
+    # at once, beyond so many pixels and times the flow before, or loses so many features, has gone on
+    # unseen.
+    min_px: float = 3.0
+    factor: float = 10.0
+    lost_share: float = 0.2
+
+
+_BEGUN = _BegunRules()
 # of the predicted motion for no motion to be possible
 _LIMIT = float(chi_square_quantile(0.9999, 6))
 _MAX_LINES = 3  # rows of repetitions that are reported one by one
-_GYRO_NOISE = 2e-4  # rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), of a rig's IMU by its data sheet
-_ACCEL_NOISE = 1.2e-2
+
+
+class _StillNoise(NamedTuple):
+    """Noise of an IMU at rest by its data sheet."""
+
+    # rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), of a rig's IMU by its data sheet
+    gyro_density: float = 2e-4
+    accel_density: float = 1.2e-2
+
+
+_STILL = _StillNoise()
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +112,7 @@ class FrozenImages:
         self._same_depth = False  # that of the frame before was one
         self._expected: Prediction | None = None  # of the present frame
         # median error of each frame's predicted pixels
-        self._errors_px: deque[float] = deque(maxlen=_RECENT)
+        self._errors_px: deque[float] = deque(maxlen=_FLOW.recent_frames)
 
     def sample(self, sample: ImuSample) -> None:
         """Take a sample of the IMU."""
@@ -103,8 +130,8 @@ class FrozenImages:
         self._seen = seen
         if self._ended_still is not None and before is not None and len(before):
             since, before_px = self._ended_still
-            begun = self._flow_px() > max(_BEGUN_PX, _BEGUN_FACTOR * before_px)
-            if begun or np.isin(before.ids, seen.ids).mean() < _BEGUN_SHARE:
+            begun = self._flow_px() > max(_BEGUN.min_px, _BEGUN.factor * before_px)
+            if begun or np.isin(before.ids, seen.ids).mean() < _BEGUN.lost_share:
                 self._held_since = since
         self._ended_still = None
 
@@ -171,10 +198,12 @@ class FrozenImages:
             return None
         if again:
             return Repeated(shown.index, False) if _unmoved(shown, frame, self._seen) else None
-        if len(self._errors_px) < _MIN_RECENT or not self._contradicts(expected.motion):
+        if len(self._errors_px) < _FLOW.min_recent_frames or not self._contradicts(expected.motion):
             return None
         moving = _predicted_to_move(
-            self._seen, expected, max(_PREDICTED_PX, _ERRORS * max(self._errors_px))
+            self._seen,
+            expected,
+            max(_FLOW.min_predicted_px, _FLOW.prediction_errors * max(self._errors_px)),
         )
         # The IMU comes last, as nearly every new frame has moved.
         frozen = _unmoved(shown, frame, moving) and not self._at_standstill()
@@ -184,7 +213,7 @@ class FrozenImages:
         """Whether the rig moves: by the last frames' features, the IMU's samples, else by the
         prediction.
         """
-        if self._flow_px() > _MOVED_PX:
+        if self._flow_px() > _FLOW.moved_px:
             return True
         if self._imu:
             return not self._at_standstill()
@@ -199,8 +228,8 @@ class FrozenImages:
         times_s = np.array([x.time_ns - self._imu[-1].time_ns for x in self._imu]) * S_PER_NS
         gyro = np.array([x.gyro for x in self._imu])
         accel = np.array([x.accel for x in self._imu])
-        return blocks_agree(times_s, gyro, _GYRO_NOISE) and blocks_agree(
-            times_s, accel, _ACCEL_NOISE
+        return blocks_agree(times_s, gyro, _STILL.gyro_density) and blocks_agree(
+            times_s, accel, _STILL.accel_density
         )
 
     def _contradicts(self, motion: MotionPrior | None) -> bool:
@@ -217,7 +246,7 @@ def _equal(a: Image, b: Image) -> bool:
     """Whether two images (H, W) are the same to the bit; most differ in their first rows, and
     need no more.
     """
-    return np.array_equal(a[:_FIRST_ROWS], b[:_FIRST_ROWS]) and np.array_equal(a, b)
+    return np.array_equal(a[: _FLOW.first_rows], b[: _FLOW.first_rows]) and np.array_equal(a, b)
 
 
 def _moved(before: Observations, now: Observations | TrackPrior) -> tuple[IntArray, FloatArray]:
@@ -231,7 +260,7 @@ def _moved(before: Observations, now: Observations | TrackPrior) -> tuple[IntArr
 def _median_flow_px(before: Observations, now: Observations) -> float:
     """Median flow of the features of two frames in the left image; 0: they share too few."""
     _, moved_px = _moved(before, now)
-    return median(moved_px) if len(moved_px) >= _MIN_CORNERS else 0.0
+    return median(moved_px) if len(moved_px) >= _FLOW.min_corners else 0.0
 
 
 def _same_depths(a: FloatArray, b: FloatArray) -> bool:
@@ -254,10 +283,13 @@ def _images(frame: StereoFrame) -> list[Image]:
 
 def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
     """Whether features have not moved since they were seen, in both images."""
-    of_images = seen.z[:_CORNERS, :2], seen.z[seen.has_right][:_CORNERS, 2:]
+    of_images = seen.z[: _FLOW.corners, :2], seen.z[seen.has_right][: _FLOW.corners, 2:]
     for old, new, pixels in zip(_images(before), _images(now), of_images, strict=False):
         flow = corner_flow(old, new, pixels)
-        if len(flow) < _MIN_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
+        if (
+            len(flow) < _FLOW.min_corners
+            or np.mean(np.linalg.norm(flow, axis=1) < _FLOW.unmoved_px) < _FLOW.unmoved_share
+        ):
             return False
     return True
 

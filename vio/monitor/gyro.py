@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +17,18 @@ from vio.monitor.accelerometer import AXES_WORSE, axes_text, signed_permutations
 from vio.monitor.force_fit import Evidence
 from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit
 
-_DISAGREES = 0.5  # share of the rotation that the best linear map leaves unexplained
-# excess allowed where readings are clipped, which rotates and shortens the gyro's rates
-_EXCESS_CLIPPED = 0.5
-_EXCESS_BRIEF = 0.7  # likewise with fewer intervals than in the first evaluation
+
+class _ExcessRules(NamedTuple):
+    """When the gyro explains too little of the rotation."""
+
+    # share of the rotation that the best linear map leaves unexplained
+    disagreeing_share: float = 0.5
+    # excess allowed where readings are clipped, which rotates and shortens the gyro's rates
+    clipped_share: float = 0.5
+    brief_share: float = 0.7  # likewise with fewer intervals than in the first evaluation
+
+
+_EXCESS = _ExcessRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +48,11 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     gyro_fit = evidence.gyro_fit
     R = evidence.R_cam0_imu
     brief = evidence.brief
-    if gyro_fit.unexplained > _DISAGREES:
+    if gyro_fit.unexplained > _EXCESS.disagreeing_share:
         return [] if brief else [_disagreement(gyro_fit)]
-    limit = max(gyro_fit.tolerance, _EXCESS_CLIPPED * evidence.clipped, _EXCESS_BRIEF * brief)
+    limit = max(
+        gyro_fit.tolerance, _EXCESS.clipped_share * evidence.clipped, _EXCESS.brief_share * brief
+    )
     if gyro_fit.unexplained > AGREES or gyro_fit.excess(R, 1.0) < limit:
         return []
     if gyro_fit.fits(R):
@@ -52,7 +63,7 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     likely = _explanations(R, gyro_alone=_gyro_alone(evidence, unit))
     uncertain = brief or evidence.clipped
     # A bias that jumps, or a mount that has turned a little, is explained by some rotation, too.
-    far = gyro_fit.excess(R, max(gyro_fit.scale(R), 0.0)) > _DISAGREES
+    far = gyro_fit.excess(R, max(gyro_fit.scale(R), 0.0)) > _EXCESS.disagreeing_share
     for mistake in chain(likely, () if uncertain else _free_explanations(gyro_fit.S_cg)):
         if gyro_fit.fits(mistake.C):
             seen = f"{seen}, and {mistake.seen}"

@@ -4,6 +4,8 @@ jitter of stamps.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -14,25 +16,40 @@ from vio.monitor.motion import Record
 from vio.numerics.robust import robust_sigma
 from vio.records import BoolArray
 
-_MIN_RATE_RADPS = 0.02  # a gyro is not judged where the camera rotates less
-_CLEAR_OF_NOISE = 5.0  # the camera's rates must exceed their noise by this factor
+
+class _RateRules(NamedTuple):
+    """When the gyro contradicts the camera's rotation."""
+
+    min_rate_radps: float = 0.02  # a gyro is not judged where the camera rotates less
+    clear_of_noise: float = 5.0  # the camera's rates must exceed their noise by this factor
+    # misfit over the best linear map, as a share of the rotation: 11 degrees, or 20 % of scale
+    excess_share: float = 0.2
+    # over the intervals, times the unexplained share: squared excess due to the map's free parameters
+    chance_intervals: float = 30.0
+    clearly_worse: float = 2.0
+    named_offset_s: float = 0.02
+
+
+_RATES = _RateRules()
 # share of the rotation that the best linear map leaves unexplained: below, explanations are judged
 AGREES = 0.2
-# misfit over the best linear map, as a share of the rotation: 11 degrees, or 20 % of scale
-_EXCESS = 0.2
-# over the intervals, times the unexplained share: squared excess due to the map's free parameters
-_CHANCE = 30.0
-_CLEARLY_WORSE = 2.0
-_NAMED_OFFSET_S = 0.02
 _NEAR_OFFSETS_S = np.arange(-0.1, 0.1001, 0.01)
 FAR_OFFSETS_S = np.arange(-5.0, 5.001, 0.025)
-# Of stamps that jitter.
-_MIN_INTERVALS = 40
-_MIN_JITTER_RATE_RADPS = 0.1  # where a millisecond is 0.1 mrad, about what the images resolve
-_MIN_JITTER_S = 5e-4  # standard deviation of the intervals; smaller does little harm
+
+
+class _JitterRules(NamedTuple):
+    """When stamps jitter."""
+
+    # Of stamps that jitter.
+    min_intervals: int = 40
+    min_rate_radps: float = 0.1  # where a millisecond is 0.1 mrad, about what the images resolve
+    min_sigma_s: float = 5e-4  # standard deviation of the intervals; smaller does little harm
+    min_correlation: float = 0.7
+
+
+_JITTER = _JitterRules()
 # of the time missed by the gyro over the stamps' deviation: 1 for jitter, 0 for true intervals
 _SLOPE = 0.7, 1.3
-_MIN_CORRELATION = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +81,7 @@ class GyroFit:
     @property
     def axes(self) -> int:
         """Number of axes about which the camera clearly rotates."""
-        clear = max(_MIN_RATE_RADPS, _CLEAR_OF_NOISE * self.noise_radps)
+        clear = max(_RATES.min_rate_radps, _RATES.clear_of_noise * self.noise_radps)
         return int(np.sum(self.rms_rates_radps > clear))
 
     def scale(self, C: FloatArray) -> float:
@@ -84,7 +101,10 @@ class GyroFit:
     @property
     def tolerance(self) -> float:
         """The excess up to which a map is accepted."""
-        return max(_EXCESS, float(np.sqrt(_CHANCE / max(self.count, 1) * self.unexplained)))
+        return max(
+            _RATES.excess_share,
+            float(np.sqrt(_RATES.chance_intervals / max(self.count, 1) * self.unexplained)),
+        )
 
     def fits(self, C: FloatArray) -> bool:
         """Return whether an orthogonal map (3, 3) from gyro to camera is accepted at its best
@@ -183,12 +203,12 @@ def _moments(omega: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[F
 
 def judge_offset(gyro_fit: GyroFit, record: Record, least: int) -> InertialFinding | None:
     """Report a relevant clock offset, where the rotation determines it clearly."""
-    if abs(gyro_fit.offset_s) < _NAMED_OFFSET_S or gyro_fit.unexplained > AGREES:
+    if abs(gyro_fit.offset_s) < _RATES.named_offset_s or gyro_fit.unexplained > AGREES:
         return None
     as_stamped = _at_offset(record, np.zeros(1), least, gyro_fit.noise_radps)
     if (
         as_stamped is not None
-        and as_stamped.unexplained < _CLEARLY_WORSE * gyro_fit.unexplained + 0.003
+        and as_stamped.unexplained < _RATES.clearly_worse * gyro_fit.unexplained + 0.003
     ):
         return None
     left = (
@@ -220,8 +240,8 @@ def judge_stamps(record: Record) -> InertialFinding | None:
     camera = np.linalg.norm(record.twists[:, 3:], axis=1)
     dt = record.end - record.begin
     usual = float(np.median(dt)) if len(dt) else 0.0
-    used = covered[0] & (gyro > _MIN_JITTER_RATE_RADPS) & (np.abs(dt - usual) < 0.5 * usual)
-    if used.sum() < _MIN_INTERVALS or robust_sigma(dt[used] - usual) < _MIN_JITTER_S:
+    used = covered[0] & (gyro > _JITTER.min_rate_radps) & (np.abs(dt - usual) < 0.5 * usual)
+    if used.sum() < _JITTER.min_intervals or robust_sigma(dt[used] - usual) < _JITTER.min_sigma_s:
         return None
     # the angle's error is the same everywhere, the time's error falls with the rate
     weight = gyro[used]
@@ -229,7 +249,7 @@ def judge_stamps(record: Record) -> InertialFinding | None:
     missed = weight * (dt[used] - dt[used] * camera[used] / gyro[used])
     slope = float(deviation @ missed / (deviation @ deviation))
     correlation = float(deviation @ missed / np.sqrt((deviation @ deviation) * (missed @ missed)))
-    if not _SLOPE[0] < slope < _SLOPE[1] or correlation < _MIN_CORRELATION:
+    if not _SLOPE[0] < slope < _SLOPE[1] or correlation < _JITTER.min_correlation:
         return None
     jitter_ms = 1e3 * robust_sigma(dt[used] - usual) / np.sqrt(2)
     return InertialFinding(

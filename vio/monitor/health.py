@@ -5,6 +5,7 @@ each event is one line.
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,22 +16,45 @@ from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, BoolArray, Estimate, IntArray, Observations, UpdateReport
 
-_NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a prediction only
-_GAP_S = 0.5  # between frames: a gap if longer, and so many times the usual time
-_GAP_STEPS = 5.0
-_MIN_STEPS = 5  # between frames, for the usual time to be known; and that it is taken from
-_RECENT_STEPS = 50
-# No rig comes to this by a camera that turns in its mount (docs/notes/design_decisions.md,
-# swapped cameras).
-_OTHER_PAIR_PX = 10.0
-_SCALE_OFF_PERCENT = 1.0  # of baseline or focal length, both to be exceeded
-_SCALE_SIGMAS = 3.0
-_RESTART_EVENT_S = 1.0  # restarts that follow each other within this time are one event
-_MAX_SPEED_MPS = 100.0
+
+class _GapRules(NamedTuple):
+    """When frames or features are missing."""
+
+    unseen_s: float = 1.0  # without a usable feature for longer, the pose is a prediction only
+    min_s: float = 0.5  # between frames: a gap if longer, and so many times the usual time
+    steps: float = 5.0
+    min_steps: int = 5  # between frames, for the usual time to be known; and that it is taken from
+    recent_steps: int = 50
+
+
+_GAPS = _GapRules()
+
+
+class _RigRules(NamedTuple):
+    """When the estimated calibration is that of no rig."""
+
+    # No rig comes to this by a camera that turns in its mount (docs/notes/design_decisions.md,
+    # swapped cameras).
+    other_pair_px: float = 10.0
+    scale_off_percent: float = 1.0  # of baseline or focal length, both to be exceeded
+    scale_sigmas: float = 3.0
+
+
+_RIG = _RigRules()
+
+
+class _StateRules(NamedTuple):
+    """When an estimate is impossible."""
+
+    restart_event_s: float = 1.0  # restarts that follow each other within this time are one event
+    max_speed_mps: float = 100.0
+    max_gyro_bias_radps: float = 0.5
+    max_accel_bias_mps2: float = 3.0
+
+
+_POSSIBLE = _StateRules()
 _STATE = ("speed", "gyro bias", "accelerometer bias")  # what is implausible of a state
 _SCALES = ("baseline", "focal length")
-_MAX_GYRO_BIAS_RADPS = 0.5
-_MAX_ACCEL_BIAS_MPS2 = 3.0
 
 
 def is_corrected(finding: Finding) -> bool:
@@ -50,7 +74,7 @@ class RunHealth:
         # index and time of the last frame with used features
         self._last_used: tuple[int, int] | None = None
         self._without_features = False
-        self._steps_s: deque[float] = deque(maxlen=_RECENT_STEPS)
+        self._steps_s: deque[float] = deque(maxlen=_GAPS.recent_steps)
         self._last_index = 0
         self._reported: set[str] = set()
         self._restarted_ns: int | None = None  # time of the last restart
@@ -62,7 +86,7 @@ class RunHealth:
         last_ns = self._restarted_ns
         self._restarted_ns = estimate.time_ns
         self._last = estimate.time_ns, estimate.T_world_imu[:3, 3].copy()
-        if last_ns is not None and (estimate.time_ns - last_ns) * 1e-9 < _RESTART_EVENT_S:
+        if last_ns is not None and (estimate.time_ns - last_ns) * 1e-9 < _POSSIBLE.restart_event_s:
             return ()
         sigma = _position_sigma(estimate)
         message = (
@@ -116,10 +140,10 @@ class RunHealth:
         step_s = (estimate.time_ns - last[0]) * 1e-9
         usual_s = np.inf
         # a shorter one is no gap, whatever is usual
-        if step_s > _GAP_S and len(self._steps_s) >= _MIN_STEPS:
+        if step_s > _GAPS.min_s and len(self._steps_s) >= _GAPS.min_steps:
             usual_s = median(self._steps_s)
         self._steps_s.append(step_s)
-        if step_s <= max(_GAP_S, _GAP_STEPS * usual_s):
+        if step_s <= max(_GAPS.min_s, _GAPS.steps * usual_s):
             return []
         sigma = _position_sigma(estimate)
         message = (
@@ -144,7 +168,7 @@ class RunHealth:
         self._reported.add("stereo")
         seen = f"frame {index}: the rows of left and right images differ by {field.rows_rms_px:.2f} px (rms)"
         figures = {"rows_rms_px": field.rows_rms_px}
-        if field.rows_rms_px > _OTHER_PAIR_PX:
+        if field.rows_rms_px > _RIG.other_pair_px:
             message = (
                 f"{seen}: left and right are exchanged, the calibration is not that of these "
                 "images, or a camera was moved; `vio calibrate` finds which; what the calibration "
@@ -167,7 +191,7 @@ class RunHealth:
         found = {} if estimate.stereo_scale is None else estimate.stereo_scale.percent()
         for name, (percent, sigma) in found.items():
             if (
-                abs(percent) <= max(_SCALE_OFF_PERCENT, _SCALE_SIGMAS * sigma)
+                abs(percent) <= max(_RIG.scale_off_percent, _RIG.scale_sigmas * sigma)
                 or name in self._reported
             ):
                 continue
@@ -204,7 +228,7 @@ class RunHealth:
             message = f"frame {index}: features again, after {away_s:.1f} s without"
             return [Finding("no-features", message, index, ended=True)]
         seconds = (time_ns - self._last_used[1]) * 1e-9
-        if self._without_features or seconds < _NO_FEATURES_S:
+        if self._without_features or seconds < _GAPS.unseen_s:
             return []
         self._without_features = True
         sigma = _position_sigma(estimate)
@@ -224,11 +248,11 @@ class RunHealth:
                 (estimate.time_ns - self._last[0]) * 1e-9
             )
             line = f"frame {index}: the estimate moves at {speed:.0f} m/s: the filter has diverged"
-            lines += self._once(index, "speed", speed, _MAX_SPEED_MPS, line)
+            lines += self._once(index, "speed", speed, _POSSIBLE.max_speed_mps, line)
         self._last = estimate.time_ns, position
         for name, bias, limit, unit in (
-            ("gyro bias", estimate.gyro_bias, _MAX_GYRO_BIAS_RADPS, "rad/s"),
-            ("accelerometer bias", estimate.accel_bias, _MAX_ACCEL_BIAS_MPS2, "m/s^2"),
+            ("gyro bias", estimate.gyro_bias, _POSSIBLE.max_gyro_bias_radps, "rad/s"),
+            ("accelerometer bias", estimate.accel_bias, _POSSIBLE.max_accel_bias_mps2, "m/s^2"),
         ):
             if bias is not None:
                 size = float(np.linalg.norm(bias))
@@ -249,13 +273,21 @@ def _position_sigma(estimate: Estimate) -> float:
     return float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
 
 
-_SPAN_S = 1.0
-_MIN_FRAMES = 3
-_MAX_REFUSED = 0.4  # of the features over the span; healthy recordings come to a third at most
+class _RefusedRules(NamedTuple):
+    """When the filter refuses what it is given."""
+
+    span_s: float = 1.0
+    min_frames: int = 3
+    # of the features over the span; healthy recordings come to a third at most
+    max_share: float = 0.4
+    # of the features, at most, where half of those refused are: then they lie together
+    together_share: float = 0.2
+    # innovations over their standard deviation: more, and the motion sensor contradicts the images
+    contradicted_sigmas: float = 2.0
+
+
+_REFUSED = _RefusedRules()
 _CELLS = 6, 4  # columns and rows that the image is divided into
-_TOGETHER = 0.2  # of the features, at most, where half of those refused are: then they lie together
-# innovations over their standard deviation: more, and the motion sensor contradicts the images
-_CONTRADICTED = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,14 +329,18 @@ class RefusalReport:
         self._used += used
         self._gated += gated
         full = False
-        while seen.time_ns - self._frames[0].time_ns >= _SPAN_S * 1e9:
+        while seen.time_ns - self._frames[0].time_ns >= _REFUSED.span_s * 1e9:
             old = self._frames.popleft()
             self._used -= old.used
             self._gated -= old.gated
             full = True
         kept = self._used
         gone = self._gated
-        if not full or len(self._frames) < _MIN_FRAMES or gone <= _MAX_REFUSED * (kept + gone):
+        if (
+            not full
+            or len(self._frames) < _REFUSED.min_frames
+            or gone <= _REFUSED.max_share * (kept + gone)
+        ):
             return []
         self._reported = True
         share = gone / (kept + gone)
@@ -319,7 +355,7 @@ class RefusalReport:
         """The likeliest cause by the evidence."""
         ratios = [f.innovation_ratio for f in self._frames if f.innovation_ratio is not None]
         ratio = median(ratios) if ratios else 0.0
-        if self.imu and ratio > _CONTRADICTED:
+        if self.imu and ratio > _REFUSED.contradicted_sigmas:
             return (
                 f"the images show features {ratio:.1f} standard deviations beside where the IMU "
                 "predicts them; "
@@ -359,7 +395,7 @@ class RefusalReport:
         count = np.bincount(cells[refused], minlength=len(total))
         order = np.argsort(-count / np.maximum(total, 1), kind="stable")
         half = 1 + np.searchsorted(np.cumsum(count[order]), count.sum() / 2)
-        if total[order[:half]].sum() > _TOGETHER * total.sum():
+        if total[order[:half]].sum() > _REFUSED.together_share * total.sum():
             return None
         u, v = np.median(pixels[refused & np.isin(cells, order[:half])], axis=0)
         return f"in the image, around ({u:.0f}, {v:.0f})"

@@ -10,7 +10,7 @@ explanation does not; for equations (I1) to (I4) see docs/inertial.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -34,10 +34,18 @@ from vio.records import (
 if TYPE_CHECKING:
     from vio.calibration.inertial import Rates
 
-_MIN_AT_END = 20  # intervals needed to judge at the end of a run
-# intervals between evaluations after `_ENOUGH`; until then `FIRST_EVALUATION`
-_LATER_EVALUATIONS = 150
-_ENOUGH = 400  # intervals with rotation about all axes after which the comparison ends
+
+class _EvaluationRules(NamedTuple):
+    """When the IMU is judged."""
+
+    min_intervals_at_end: int = 20  # intervals needed to judge at the end of a run
+    # intervals between evaluations after `_EVALUATIONS.enough_intervals`; until then `FIRST_EVALUATION`
+    later_intervals: int = 150
+    # intervals with rotation about all axes after which the comparison ends
+    enough_intervals: int = 400
+
+
+_EVALUATIONS = _EvaluationRules()
 
 
 class InertialCheck:
@@ -125,7 +133,9 @@ class InertialCheck:
         self._since_evaluation += len(motion)
         self._seen += len(motion)
         if self._since_evaluation < (
-            FIRST_EVALUATION if self._seen < _ENOUGH else _LATER_EVALUATIONS
+            FIRST_EVALUATION
+            if self._seen < _EVALUATIONS.enough_intervals
+            else _EVALUATIONS.later_intervals
         ):
             if self.rotation_comparison is None:
                 self._compare_first_rotations()
@@ -147,9 +157,9 @@ class InertialCheck:
         if motion is None:
             return [] if size.finding is None else [size.finding]
         record = record_of(motion, times_ns, values)
-        gyro_fit = fit_gyro(record, _MIN_AT_END)
+        gyro_fit = fit_gyro(record, _EVALUATIONS.min_intervals_at_end)
         if gyro_fit is None:
-            if self._seen >= _ENOUGH:
+            if self._seen >= _EVALUATIONS.enough_intervals:
                 self.rotation_comparison = self.rotation_comparison or ROTATION_NOT_COMPARABLE
                 self.axes_compared = True
             return self._judge_stationary(size, record, last=last)
@@ -162,7 +172,10 @@ class InertialCheck:
             force=force,
             early_force=early,
             # The accelerometer decides whether gyro or extrinsics are at fault: wait for it.
-            force_final=force is not None or size.unit is None or last or gyro_fit.count >= _ENOUGH,
+            force_final=force is not None
+            or size.unit is None
+            or last
+            or gyro_fit.count >= _EVALUATIONS.enough_intervals,
             clipped=self.clipped or "saturation" in self._reported,
             last=last,
         )
@@ -177,7 +190,11 @@ class InertialCheck:
         """
         found = [] if size.finding is None else [size.finding]
         means, covered = record.means(np.zeros(1))
-        if last and size.unit is not None and int(covered.sum()) >= _MIN_AT_END:
+        if (
+            last
+            and size.unit is not None
+            and int(covered.sum()) >= _EVALUATIONS.min_intervals_at_end
+        ):
             from vio.monitor.accelerometer import judge_up
 
             found += judge_up(means[0, covered[0], 3:], self._T[:3, :3], measured=False)
@@ -193,7 +210,7 @@ class InertialCheck:
         gyro_fit = evidence.gyro_fit
         last = evidence.last
         size = resolve_size(size, evidence)
-        offset = judge_offset(gyro_fit, record, _MIN_AT_END)
+        offset = judge_offset(gyro_fit, record, _EVALUATIONS.min_intervals_at_end)
         found = [f for f in (size.finding, offset, judge_stamps(record)) if f is not None]
         rotation = judge_gyro(evidence, size.unit or 1.0)
         found += rotation
@@ -207,7 +224,7 @@ class InertialCheck:
         # whatever turns out to be the cause
         self.imu_at_fault |= agrees and not gyro_fit.fits(evidence.R_cam0_imu)
         enough = (
-            gyro_fit.count >= _ENOUGH
+            gyro_fit.count >= _EVALUATIONS.enough_intervals
             and gyro_fit.axes == 3
             and (measured or size.unit is None or bool(rotation))
         )
@@ -229,7 +246,7 @@ class InertialCheck:
             return
         self.imu_at_fault = judge_size(times_ns, values[:, 3:]).finding is not None
         record = record_of(motion, times_ns, values)
-        gyro_fit = fit_gyro(record, _MIN_AT_END)
+        gyro_fit = fit_gyro(record, _EVALUATIONS.min_intervals_at_end)
         turns = None if gyro_fit is None else compare_rotations(record, gyro_fit, self._T[:3, :3])
         if turns is not None and np.isfinite(turns.sigma) and turns.agree:
             self.rotation_comparison = turns

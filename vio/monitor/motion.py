@@ -4,6 +4,8 @@ clock.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -16,10 +18,18 @@ from vio.numerics.robust import median
 from vio.records import S_PER_NS, BoolArray, IntArray, Observations, feature_tracks, shared_rows
 
 BATCH = 20  # frames whose motion is computed at once
-_TRACKS = 80  # tracks of a frame that the camera's motion is computed from
-_MIN_LINKS = 15  # tracks between two frames
-_LONGEST_INTERVAL_S = 0.25
-_SAME_S = 1e-6  # intervals whose end and start differ by less are contiguous
+
+
+class _TwistRules(NamedTuple):
+    """From what the camera's motion is computed."""
+
+    tracks_per_frame: int = 80  # tracks of a frame that the camera's motion is computed from
+    min_links: int = 15  # tracks between two frames
+    max_interval_s: float = 0.25
+    same_s: float = 1e-6  # intervals whose end and start differ by less are contiguous
+
+
+_TWISTS = _TwistRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +58,12 @@ class CameraTwists:
     def frame(self, seen: Observations) -> Intervals | None:
         """Add one frame; every `BATCH` frames, return the motions since the last batch."""
         rows = np.flatnonzero(seen.has_right & ~seen.stale)
-        if len(rows) > _TRACKS:
+        if len(rows) > _TWISTS.tracks_per_frame:
             # The same random choice of ids in every frame, so that tracks continue.
             hashed = (seen.ids[rows] * np.int64(2654435761)) & np.int64(0xFFFFFFFF)
-            rows = np.sort(rows[np.argpartition(hashed, _TRACKS)[:_TRACKS]])
+            rows = np.sort(
+                rows[np.argpartition(hashed, _TWISTS.tracks_per_frame)[: _TWISTS.tracks_per_frame]]
+            )
         kept = seen.take(rows)
         if self._kept:
             last = self._kept[-1]
@@ -83,8 +95,8 @@ class CameraTwists:
         tracks = feature_tracks(dict(enumerate(kept)), len(kept))
         times_ns = np.array([o.time_ns for o in kept], dtype=np.int64)
         found = stereo_twists(self._camera, tracks, times_ns, np.array(self._guess))
-        good = (links[found.frames] >= _MIN_LINKS) & (
-            np.diff(times_ns)[found.frames] * S_PER_NS < _LONGEST_INTERVAL_S
+        good = (links[found.frames] >= _TWISTS.min_links) & (
+            np.diff(times_ns)[found.frames] * S_PER_NS < _TWISTS.max_interval_s
         )
         frames = found.frames[good]
         self._kept = kept[-1:]
@@ -132,7 +144,7 @@ class Record:
     @property
     def joined(self) -> BoolArray:
         """Whether each interval (K,) starts where the previous one ends."""
-        return np.concatenate([[False], np.abs(self.begin[1:] - self.end[:-1]) < _SAME_S])
+        return np.concatenate([[False], np.abs(self.begin[1:] - self.end[:-1]) < _TWISTS.same_s])
 
     def means(self, offsets: npt.NDArray[np.floating]) -> tuple[FloatArray, BoolArray]:
         """Return mean readings (M, K, 6) over the intervals shifted by offsets (M,), and a mask

@@ -5,6 +5,7 @@ clipping, magnitude.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,13 +19,28 @@ GAP_S = 0.1  # readings further apart are a gap …
 GAP_STEPS = 8.0  # … if that is so many times their usual interval
 MEMORY_S = 60.0  # older readings and motions are dropped
 
-_MIN_RUN = 5  # equal readings at the extreme in a row
-_MIN_CHANCE = 1e-8  # probability of such a run by quantisation alone
-_SMOOTH = 0.1  # share of changes of another sign than the one before; of noise it is 2/3
-_MIN_LEVELS = 20  # different readings on the axis
 
-_SMOOTH_S = 0.2  # readings are averaged over this time before their magnitude is judged
-_MIN_SIZE_S = 1.0
+class _ClippingRules(NamedTuple):
+    """When readings end at the range."""
+
+    min_run: int = 5  # equal readings at the extreme in a row
+    min_chance: float = 1e-8  # probability of such a run by quantisation alone
+    # share of changes of another sign than the one before; of noise it is 2/3
+    smooth_share: float = 0.1
+    min_levels: int = 20  # different readings on the axis
+
+
+_CLIPPING = _ClippingRules()
+
+
+class _SizeRules(NamedTuple):
+    """From what the magnitude of readings is judged."""
+
+    averaged_s: float = 0.2  # readings are averaged over this time before their magnitude is judged
+    min_s: float = 1.0
+
+
+_SIZE = _SizeRules()
 _GRAVITY = 9.80665  # m/s^2, and what readings in mg have
 _MILLI_G = 1000.0
 
@@ -110,23 +126,26 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
     """Yield runs of equal readings at the extreme of an axis that quantisation or held samples
     do not explain.
     """
-    if len(values) < 4 * _MIN_RUN:
+    if len(values) < 4 * _CLIPPING.min_run:
         return
     equal = values[1:] == values[:-1]
     for axis in range(6):
         for extreme in (values[:, axis].max(), values[:, axis].min()):
             at = values[:, axis] == extreme
             # no sensor's range ends at 0: that of a simulator without noise, at rest
-            if extreme == 0.0 or at.sum() < _MIN_RUN or at.all():
+            if extreme == 0.0 or at.sum() < _CLIPPING.min_run or at.all():
                 continue
             if _has_no_noise(values, at, axis):
                 continue
             # Equal neighbours elsewhere are due to chance: a run of n has the probability
             # held^(n-1).
             held = float(np.mean(equal[~(at[1:] & at[:-1]), axis]))
-            chance = np.log(_MIN_CHANCE) / np.log(held) if held > 0 else 0.0
+            chance = np.log(_CLIPPING.min_chance) / np.log(held) if held > 0 else 0.0
             run = _longest_run(at)
-            if run < max(_MIN_RUN, 1 + chance) or len(np.unique(values[:, axis])) < _MIN_LEVELS:
+            if (
+                run < max(_CLIPPING.min_run, 1 + chance)
+                or len(np.unique(values[:, axis])) < _CLIPPING.min_levels
+            ):
                 continue
             name, unit = ("gyro", "rad/s") if axis < 3 else ("accelerometer", "m/s^2")
             yield InertialFinding(
@@ -156,7 +175,7 @@ def _has_no_noise(values: FloatArray, at: BoolArray, axis: int) -> bool:
     changes = np.diff(values[:, others], axis=0)
     turns = changes[1:] * changes[:-1] < 0
     inside = at[2:] & at[1:-1] & at[:-2]
-    return bool(inside.any() and turns[inside].mean() < _SMOOTH)
+    return bool(inside.any() and turns[inside].mean() < _CLIPPING.smooth_share)
 
 
 def _longest_run(mask: BoolArray) -> int:
@@ -177,15 +196,15 @@ class Size:
 def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
     """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,)."""
     t = np.asarray((times_ns - times_ns[0]) * S_PER_NS, dtype=np.float64)
-    if t[-1] < _MIN_SIZE_S:
+    if t[-1] < _SIZE.min_s:
         return Size(None, 1.0)
     integral = np.concatenate(
         [np.zeros((1, 3)), np.cumsum(np.diff(t)[:, None] * (accel[1:] + accel[:-1]) / 2, axis=0)]
     )
-    edges = np.arange(0.0, t[-1], _SMOOTH_S)
+    edges = np.arange(0.0, t[-1], _SIZE.averaged_s)
     mean = (
         np.diff(np.stack([np.interp(edges, t, integral[:, k]) for k in range(3)], axis=1), axis=0)
-        / _SMOOTH_S
+        / _SIZE.averaged_s
     )
     size = np.linalg.norm(mean, axis=1)
     usual = median(size)

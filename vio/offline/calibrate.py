@@ -7,6 +7,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,12 +64,22 @@ class _Segments:
 
 
 _IN_MOTION = _Segments()
-# What the gate leaves of a camera that is far off is biased: it is measured again with what was
-# found taken out, until less than this is left.
-_ROUNDS = 5
-_SETTLED_DEG = 0.05
-_FRAMES_PER_PAIR = 5  # a frame of a feature file contains fewer matches than a pair of images
-_MAX_ROW_OFFSET_PX = 2.0  # with larger row differences, features are matched wrongly or not at all
+
+
+class _RoundRules(NamedTuple):
+    """How a calibration is repeated."""
+
+    # What the gate leaves of a camera that is far off is biased: it is measured again with what was
+    # found taken out, until less than this is left.
+    max_rounds: int = 5
+    settled_deg: float = 0.05
+    # a frame of a feature file contains fewer matches than a pair of images
+    frames_per_pair: int = 5
+    # with larger row differences, features are matched wrongly or not at all
+    max_row_offset_px: float = 2.0
+
+
+_ROUND = _RoundRules()
 _UNUSABLE = ("cameras swapped", "baseline translation inverted")  # features are unusable then
 
 _ROWS = "row alignment"
@@ -171,7 +182,7 @@ def measure(
         return CalibrationReport(source, stereo, rows, _no_imu(why), findings, notes)
     described = row_residuals(matches.z, *source.image_size(matches.z))
     misaligned = isinstance(described, RowResiduals) and (
-        abs(described.median_px) + described.spread_px > _MAX_ROW_OFFSET_PX
+        abs(described.median_px) + described.spread_px > _ROUND.max_row_offset_px
     )
     # features may not be of the same point
     if misaligned or any(f.fault in _UNUSABLE for f in findings):
@@ -246,7 +257,7 @@ def _match_tracks(recording: Recording, tracks: FeatureTracks, pairs: int) -> _M
     frames = tracks.frames
     fresh = tracks.has_right & ~tracks.stale
     filled = np.unique(frames[fresh])
-    spread = np.unique(np.linspace(0, len(filled) - 1, _FRAMES_PER_PAIR * pairs).astype(int))
+    spread = np.unique(np.linspace(0, len(filled) - 1, _ROUND.frames_per_pair * pairs).astype(int))
     rows = fresh & np.isin(frames, filled[spread] if len(filled) else filled)
     z = tracks.z[rows]
     # both cameras have the same intrinsics
@@ -287,7 +298,7 @@ def _measure_in_motion(
     camera = replace(recording.camera, width=int(width) + 1, height=int(height) + 1)
     off: FloatArray = np.zeros(len(PARAMETERS))
     try:
-        for _ in range(_ROUNDS):
+        for _ in range(_ROUND.max_rounds):
             z = (
                 field_of(camera, off).without(tracks.z, tracks.has_right)
                 if np.any(off)
@@ -304,7 +315,7 @@ def _measure_in_motion(
                 )
             step = self_calibrate(camera, pieces, intrinsics=False)
             held = step.after(off)
-            if np.degrees(np.linalg.norm(so3_log(step.right_camera()[0]))) < _SETTLED_DEG:
+            if np.degrees(np.linalg.norm(so3_log(step.right_camera()[0]))) < _ROUND.settled_deg:
                 break
             off = held.rig_parameters()
         free = self_calibrate(camera, pieces, intrinsics=True)

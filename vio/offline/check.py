@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,15 @@ from vio.offline.verdict import MapperResult, overall_verdict
 from vio.records import Trajectory
 from vio.runs.picture import write_picture
 
-_MATCH_S = 2.0  # for a keyframe, see `expected_minutes`
-_MAP_S = 1.0
+
+class _TimeRules(NamedTuple):
+    """What a step takes."""
+
+    match_s: float = 2.0  # for a keyframe, see `expected_minutes`
+    map_s: float = 1.0
+
+
+_TIMES = _TimeRules()
 _MARGIN = 0.15  # of the path's extent, left free about it
 # ratio of largest to median distance beyond which a linear axis shows the largest only
 _LOGARITHMIC = 30.0
@@ -39,7 +46,7 @@ def expected_minutes(keyframes: int, mappers: Sequence[Mapper]) -> float:
     Measured with 30 keyframes of 1226 x 370 pixels: 1.8 s each for features and matches, 1.0 and
     0.7 s for the mappers.
     """
-    return keyframes * (_MATCH_S + _MAP_S * len(mappers)) / 60
+    return keyframes * (_TIMES.match_s + _TIMES.map_s * len(mappers)) / 60
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -28,9 +28,18 @@ from vio.runs.stated import read_metrics
 FACTS = "earth.json"
 _UP_RAD = float(np.radians(0.3))  # of an IMU's vertical; of an upright camera's
 _MOUNT_RAD = float(np.radians(5.0))
-_MIN_COMMON = 3  # keyframes that run and map share
-_SAME = 0.05  # by which a motion between two of them may differ, m and rad, and share of it
-_SAME_SHARE = 0.1
+
+
+class _CommonRules(NamedTuple):
+    """When run and map have keyframes in common."""
+
+    min_keyframes: int = 3  # keyframes that run and map share
+    # by which a motion between two of them may differ, m and rad, and share of it
+    same_motion: float = 0.05
+    same_share: float = 0.1
+
+
+_COMMON = _CommonRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +199,7 @@ def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) ->
         if sessions[row.session].part == sessions[0].part
     }
     before, now = _common(run, home)
-    if len(before) < _MIN_COMMON or not _is_one_path(before, now):
+    if len(before) < _COMMON.min_keyframes or not _is_one_path(before, now):
         raise DataError(
             f"{run}: was localised in another map than {file}; give the map that the run found its "
             "place in"
@@ -226,7 +235,10 @@ def _is_one_path(before: FloatArray, now: FloatArray) -> bool:
     """
     a, b = (se3_log(se3_inverse(T[:-1]) @ T[1:]) for T in (before, now))
     apart = np.linalg.norm(a - b, axis=1)
-    return float(np.median(apart - _SAME_SHARE * np.linalg.norm(a, axis=1))) < _SAME
+    return (
+        float(np.median(apart - _COMMON.same_share * np.linalg.norm(a, axis=1)))
+        < _COMMON.same_motion
+    )
 
 
 def keep_in_map(file: FilePath, facts: dict[str, Any]) -> None:

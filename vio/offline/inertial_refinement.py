@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,12 +25,19 @@ from vio.offline.keyframes import TrackedPath, loop_ends
 from vio.offline.points import PointTracks, build_tracks, reprojection
 from vio.records import FIELD_TERMS, ROW_TERMS, ImuSample, IntArray, MotionSample
 
-_EVERY_S = 0.25  # from keyframe to keyframe
-# On the standard deviations of pixels: errors of a track last longer than from keyframe to
-# keyframe. The same as on the motions of a map's odometry, where it was measured.
-_LASTING = 2.0
-_MIN_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
-_TINY = 1e-7  # focal lengths: of coefficients that are known
+
+class _AdjustmentRules(NamedTuple):
+    """What is adjusted, and how sure its rows are."""
+
+    every_s: float = 0.25  # from keyframe to keyframe
+    # On the standard deviations of pixels: errors of a track last longer than from keyframe to
+    # keyframe. The same as on the motions of a map's odometry, where it was measured.
+    lasting_factor: float = 2.0
+    min_sigma_px: float = 1e-3  # of exact pixels, as simulated ones may be
+    tiny: float = 1e-7  # focal lengths: of coefficients that are known
+
+
+_ADJUSTMENT = _AdjustmentRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +70,7 @@ def inertial_keyframes(path: TrackedPath, most: int | None) -> IntArray:
     seconds = _seconds(path)
     seconds = seconds - seconds[0]
     ends = loop_ends(path, most)
-    count = int(np.ceil(seconds[-1] / _EVERY_S)) + 1
+    count = int(np.ceil(seconds[-1] / _ADJUSTMENT.every_s)) + 1
     if most is not None:
         count = max(min(count, most - len(ends)), 2)
     near = np.searchsorted(seconds, np.linspace(0, seconds[-1], count) - 1e-6)
@@ -132,7 +140,9 @@ def _row_sigmas(path: TrackedPath, T_world_cam0: FloatArray, tracks: PointTracks
     for group in (tracks.by_loop, ~tracks.by_loop):
         seen = group & tracks.has_right
         if seen.any():
-            out[group] = _LASTING * max(robust_sigma(r[seen]), _MIN_SIGMA_PX)
+            out[group] = _ADJUSTMENT.lasting_factor * max(
+                robust_sigma(r[seen]), _ADJUSTMENT.min_sigma_px
+            )
     return out
 
 
@@ -141,7 +151,7 @@ def _rig_prior(run: InertialRun, last: np.void) -> RigPrior:
     pixels here, as it ended.
     """
     s = run.settings
-    field = _TINY * np.eye(FIELD_TERMS + ROW_TERMS)
+    field = _ADJUSTMENT.tiny * np.eye(FIELD_TERMS + ROW_TERMS)
     at_start = np.zeros(FIELD_TERMS + ROW_TERMS)
     if run.field is not None:
         rms_px = float(last["stereo_rows_rms_px"])
@@ -149,7 +159,9 @@ def _rig_prior(run: InertialRun, last: np.void) -> RigPrior:
         field[:FIELD_TERMS, :FIELD_TERMS] = np.diag(sigmas)
         at_start[:FIELD_TERMS] = run.field.coefficients[:FIELD_TERMS] / sigmas
         rows = last["stereo_rows_covariance"]
-        field[FIELD_TERMS:, FIELD_TERMS:] = np.linalg.cholesky(rows + _TINY**2 * np.eye(ROW_TERMS))
+        field[FIELD_TERMS:, FIELD_TERMS:] = np.linalg.cholesky(
+            rows + _ADJUSTMENT.tiny**2 * np.eye(ROW_TERMS)
+        )
     return RigPrior(
         field,
         at_start,

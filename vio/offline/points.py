@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,10 +14,17 @@ from vio.offline.keyframes import TrackedPath
 from vio.offline.loop_tracks import loop_rows
 from vio.records import BoolArray, IntArray, Landmarks
 
-_MIN_DISPARITY_PX = 0.5
+
+class _PointRules(NamedTuple):
+    """Which points are triangulated."""
+
+    min_disparity_px: float = 0.5
+    steps: int = 8
+    min_views: int = 2  # of a point
+
+
+_POINTS = _PointRules()
 MIN_DEPTH_M = 0.05
-_POINT_STEPS = 8
-_MIN_VIEWS = 2  # of a point
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +98,7 @@ def build_tracks(
     if not len(tracks.ids):
         raise EstimationError(
             f"{run.where}: not observable because no feature is seen consistently in "
-            f"{_MIN_VIEWS} keyframes; the "
+            f"{_POINTS.min_views} keyframes; the "
             "views do not overlap, the scene has no texture, or the run's poses are wrong"
         )
     return tracks
@@ -103,7 +111,7 @@ def keep_rows(tracks: PointTracks, rows: BoolArray) -> PointTracks:
     count = len(tracks.ids)
     views = np.bincount(tracks.point[rows], minlength=count)
     stereo = np.bincount(tracks.point[rows & tracks.has_right], minlength=count)
-    points = (views >= _MIN_VIEWS) & (stereo > 0)
+    points = (views >= _POINTS.min_views) & (stereo > 0)
     rows = rows & points[tracks.point]
     renumbered = np.cumsum(points) - 1
     return PointTracks(
@@ -151,7 +159,7 @@ def triangulate_tracks(
     order = np.lexsort((disparity, tracks.point))
     last = np.searchsorted(tracks.point[order], np.arange(count), side="right") - 1
     best = order[last]
-    p_cam, valid = triangulate(camera, tracks.z[best], min_disparity_px=_MIN_DISPARITY_PX)
+    p_cam, valid = triangulate(camera, tracks.z[best], min_disparity_px=_POINTS.min_disparity_px)
     valid &= tracks.has_right[best]
     p_cam = np.where(valid[:, None], p_cam, [0.0, 0.0, 1.0])
     start = T_world_cam0[tracks.keyframe[best]]
@@ -160,7 +168,7 @@ def triangulate_tracks(
     R = T_cam0_world[tracks.keyframe, :3, :3]
     by_point = np.argsort(tracks.point, kind="stable")
     begins = np.searchsorted(tracks.point[by_point], np.arange(count))
-    for step in range(_POINT_STEPS):
+    for step in range(_POINTS.steps):
         q, ahead = _in_camera(T_cam0_world, replace(tracks, p_world=p_world))
         r = tracks.z - project(camera, q)
         H = z_D_p_cam(camera, q) @ R

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,11 +14,18 @@ from vio.offline.colmap.reconstruction import Mapper, Reconstructed
 from vio.offline.comparison import KeyframeComparison, Segment, motion_differences
 from vio.records import IntArray
 
-_NAMED_DEG = 1.0  # turns from which they are named
-_TURN_DEG = 0.2  # a motion that differs by more turns the rest of the path
-# by which lengths may differ without a word: matches that are off by 0.1 px make as much at far
-# points
-_SCALE = 0.01
+
+class _TurnRules(NamedTuple):
+    """Which motions are named."""
+
+    named_deg: float = 1.0  # turns from which they are named
+    turn_deg: float = 0.2  # a motion that differs by more turns the rest of the path
+    # by which lengths may differ without a word: matches that are off by 0.1 px make as much at far
+    # points
+    scale_share: float = 0.01
+
+
+_TURNS = _TurnRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +128,7 @@ def _judged(found: dict[Mapper, KeyframeComparison], agreeing: Sequence[Mapper])
         text += f"{_ranges(comparison.segments)} is negligible"
     if comparison.scale is None:
         text += f"; lengths could not be compared, {comparison.why_no_scale}"
-    elif abs(comparison.scale - 1) > max(_SCALE, 3 * (comparison.scale_sigma or 0.0)):
+    elif abs(comparison.scale - 1) > max(_TURNS.scale_share, 3 * (comparison.scale_sigma or 0.0)):
         grade = length_grade(100 * abs(comparison.scale - 1))
         text += f", but COLMAP's path is {_longer(comparison.scale)}, {grade}: one of both has disparities that are off"
     for name in found.keys() - set(agreeing):
@@ -157,7 +165,7 @@ def _per_100_m(comparison: KeyframeComparison, segments: Sequence[Segment]) -> f
 
 
 def _grade(comparison: KeyframeComparison, segments: Sequence[Segment]) -> Grade:
-    turned = any(s.difference_deg > _TURN_DEG for s in segments)
+    turned = any(s.difference_deg > _TURNS.turn_deg for s in segments)
     grade = length_grade(_per_100_m(comparison, segments))
     return "worth calibrating" if turned and grade == "negligible" else grade
 
@@ -166,7 +174,7 @@ def _size(comparison: KeyframeComparison, segments: Sequence[Segment]) -> str:
     by = max((s.difference_m for s in segments), default=0.0)
     turned = max((s.difference_deg for s in segments), default=0.0)
     text = f"{_metres(by)} ({_per_100_m(comparison, segments):.2g} m per 100 m)"
-    return text if turned < _NAMED_DEG else f"{text} and {turned:.3g} deg"
+    return text if turned < _TURNS.named_deg else f"{text} and {turned:.3g} deg"
 
 
 def _shared(first: KeyframeComparison, second: KeyframeComparison) -> list[Segment]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import (
@@ -35,10 +35,18 @@ from vio.datasets.bags.cdr import Field, fields_of
 from vio.errors import DataError
 from vio.ros2.transport import Quality
 
-_DEPTH = 1000  # messages that wait for `spin`; of a topic that must not lose any, all
-_MAX_IMAGES = 50  # that wait where none must be lost: then the sender waits
-_TAKEN = 10_000  # at a time
-_LAST_S = 30.0  # that a receiver may take for the last messages
+
+class _QueueLimits(NamedTuple):
+    """How many messages wait."""
+
+    # messages that wait for `spin`; of a topic that must not lose any, all
+    depth_messages: int = 1000
+    max_images: int = 50  # that wait where none must be lost: then the sender waits
+    taken_messages: int = 10_000  # at a time
+    last_s: float = 30.0  # that a receiver may take for the last messages
+
+
+_QUEUE = _QueueLimits()
 _BASE: dict[str, Any] = {
     "bool": bool,
     "string": str,
@@ -103,9 +111,13 @@ def _qos(quality: Quality, *, of_images: bool = False) -> Qos:
         use_cdrv0_representation=True, use_xcdrv2_representation=False
     )
     if quality == "sensor":
-        return Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(_DEPTH), format_of_ros)
+        return Qos(
+            Policy.Reliability.BestEffort,
+            Policy.History.KeepLast(_QUEUE.depth_messages),
+            format_of_ros,
+        )
     if quality == "reliable":
-        limits = [Policy.ResourceLimits(max_samples=_MAX_IMAGES)] if of_images else []
+        limits = [Policy.ResourceLimits(max_samples=_QUEUE.max_images)] if of_images else []
         return Qos(reliable, Policy.History.KeepAll, format_of_ros, *limits)
     return Qos(
         reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(1), format_of_ros
@@ -186,7 +198,7 @@ class DdsTransport:
         taken = [
             (sample.sample_info.source_timestamp, take, sample.data)
             for reader, condition, take in self._readers
-            for sample in reader.take(_TAKEN, condition=condition)
+            for sample in reader.take(_QUEUE.taken_messages, condition=condition)
             if isinstance(sample, _Raw)
         ]
         # Topics are read one after the other: their messages are handed over in the order in which
@@ -199,7 +211,7 @@ class DdsTransport:
         it.
         """
         for writer in self._writers.values():
-            writer.wait_for_acks(duration(seconds=_LAST_S))
+            writer.wait_for_acks(duration(seconds=_QUEUE.last_s))
         for _, condition, _ in self._readers:
             self._waitset.detach(condition)
         self._readers.clear()

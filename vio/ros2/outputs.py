@@ -7,6 +7,7 @@ import logging
 import threading
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,11 +33,19 @@ KINDS = {
     POINTS: "sensor_msgs/msg/PointCloud2",
 }
 _SLOW_NS = NS_PER_S  # between paths, landmarks and diagnostics
-_PATH_POSES = 2000  # the newest ones
-_POINTS = 20_000  # likewise
-_UNKNOWN = 1e6  # variance of what is not measured
-# (rad/s)^2 of a single sample: 0.01 rad/s, of cheap gyros at some hundred hertz
-_GYRO_VARIANCE = 1e-4
+
+
+class _OutputRules(NamedTuple):
+    """What messages hold."""
+
+    path_poses: int = 2000  # the newest ones
+    max_points: int = 20_000  # likewise
+    unknown_variance: float = 1e6  # variance of what is not measured
+    # (rad/s)^2 of a single sample: 0.01 rad/s, of cheap gyros at some hundred hertz
+    gyro_variance: float = 1e-4
+
+
+_OUTPUT = _OutputRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +83,7 @@ class Outputs:
             topics["/tf"] = "tf2_msgs/msg/TFMessage"
         late = (self._names[PATH], self._names[POINTS])
         self._out = publisher(transport, topics, latched=late)
-        self._recent: deque[tuple[int, FloatArray]] = deque(maxlen=_PATH_POSES)
+        self._recent: deque[tuple[int, FloatArray]] = deque(maxlen=_OUTPUT.path_poses)
         self._failure: Exception | None = None
         self._slow_ns: int | None = None  # newest time of path, landmarks and diagnostics
         self._thread = threading.Thread(
@@ -137,9 +146,15 @@ class Outputs:
         figures = self._odometry.figures
         with contextlib.suppress(VioError):  # the odometry is being closed
             points = self._odometry.landmarks()
-            sigmas = np.sqrt(np.trace(points.covariance[-_POINTS:], axis1=1, axis2=2) / 3.0)
+            sigmas = np.sqrt(
+                np.trace(points.covariance[-_OUTPUT.max_points :], axis1=1, axis2=2) / 3.0
+            )
             self._out.points(
-                self._names[POINTS], self._frames.odom, time_ns, points.p_world[-_POINTS:], sigmas
+                self._names[POINTS],
+                self._frames.odom,
+                time_ns,
+                points.p_world[-_OUTPUT.max_points :],
+                sigmas,
             )
         warnings = self._odometry.warnings
         integrity = estimate.integrity
@@ -170,7 +185,7 @@ class Outputs:
         """
         linear = np.zeros(3)
         angular = np.zeros(3)
-        spread = np.eye(6) * _UNKNOWN
+        spread = np.eye(6) * _OUTPUT.unknown_variance
         R_body_world = estimate.T_world_imu[:3, :3].T
         if estimate.velocity_world is not None:
             linear = R_body_world @ estimate.velocity_world
@@ -178,7 +193,7 @@ class Outputs:
                 spread[:3, :3] = R_body_world @ estimate.velocity_covariance @ R_body_world.T
         if self._sensors.gyro is not None and estimate.gyro_bias is not None:
             angular = self._sensors.gyro - estimate.gyro_bias
-            spread[3:, 3:] = np.eye(3) * _GYRO_VARIANCE
+            spread[3:, 3:] = np.eye(3) * _OUTPUT.gyro_variance
         return linear, angular, spread
 
 

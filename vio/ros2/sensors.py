@@ -10,7 +10,7 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,12 +29,20 @@ from vio.ros2.transport import Quality, Transport
 log = logging.getLogger(__name__)
 
 SILENT_S = 5.0  # without a message, before it is said
-# a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
-_BACK_NS = 500_000_000
+
+
+class _StampRules(NamedTuple):
+    """When stamps begin anew."""
+
+    # a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
+    back_ns: int = 500_000_000
+    passed_share: float = 0.1
+
+
+_STAMPS = _StampRules()
 # A stamp so far ahead of the last one begins anew, too, where less than a tenth of that time has
 # passed: the clock was set. A gap in a bag that is played ten times as fast is none.
 _AHEAD_NS = 5 * NS_PER_S
-_PASSED = 0.1
 _LEVEL_IMAGES = 8  # of 16 bits, looked at for the levels of black and white
 _MAX_REASONS = 50  # that are named
 
@@ -142,7 +150,7 @@ class Sensors:
         time_ns = stamp_of(fields)
         arrived_ns = round(time.monotonic() * NS_PER_S)
         before, last, last_arrived_ns = self._newest.get(topic, (None, None, 0))
-        back = last is not None and time_ns < last - _BACK_NS
+        back = last is not None and time_ns < last - _STAMPS.back_ns
         ahead = last is not None and _is_ahead(time_ns - last, arrived_ns - last_arrived_ns)
         if last is not None and back and before is not None and before < time_ns:
             last = before  # that one was far ahead, alone; the odometry has left it out
@@ -198,7 +206,7 @@ class Sensors:
 
 def _is_ahead(step_ns: int, passed_ns: int) -> bool:
     """Whether stamps have gone ahead by far more than the time that has passed."""
-    return step_ns > _AHEAD_NS and passed_ns < _PASSED * step_ns
+    return step_ns > _AHEAD_NS and passed_ns < _STAMPS.passed_share * step_ns
 
 
 class Silence:

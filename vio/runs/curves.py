@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,8 +25,16 @@ FEATURE_WORDS = {
     "matched": "with a right match",
     "used": "used",
 }
-_MAX = 3000  # samples of a curve; more are not seen on a screen
-_MAX_POINTS = 6000
+
+
+class _CurveLimits(NamedTuple):
+    """How much of a curve is drawn."""
+
+    max_samples: int = 3000  # samples of a curve; more are not seen on a screen
+    max_points: int = 6000
+
+
+_LIMITS = _CurveLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +135,7 @@ def curves_of(runs: Sequence[FinishedRun]) -> list[Curves]:
         view = drawn.view_of_reference() if first else views[source]
         if view is not None:
             views[source] = view
-        found = draw(drawn, view, most=_MAX)
+        found = draw(drawn, view, most=_LIMITS.max_samples)
         curves.append(
             replace(found, mapped=_mapped(run, drawn, found.T_view_world, view), draws_truth=first)
         )
@@ -244,7 +253,9 @@ def _sigmas(P: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
 
 
-def thinned(count: int, most: int | None = _MAX) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def thinned(
+    count: int, most: int | None = _LIMITS.max_samples
+) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Return at most `most` row numbers of `count` (None: all), evenly spread, with the first
     and the last.
     """
@@ -255,6 +266,6 @@ def _chosen_points(run: FinishedRun) -> np.ndarray[tuple[int], np.dtype[np.int64
     """Return the row numbers of the landmarks to draw: the most certain ones, relative to their
     distance.
     """
-    if len(run.points) <= _MAX_POINTS:
+    if len(run.points) <= _LIMITS.max_points:
         return np.arange(len(run.points))
-    return np.sort(np.argsort(run.point_sigmas, kind="stable")[:_MAX_POINTS])
+    return np.sort(np.argsort(run.point_sigmas, kind="stable")[: _LIMITS.max_points])

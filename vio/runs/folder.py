@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -50,8 +50,16 @@ log = logging.getLogger(__name__)
 # Of a request: it may move, or be compared anew.
 _OF_THE_OUTPUT = ("source", "reference", "lengths_m", "save_calibration", "command", "plot")
 _SLOW = 10.0  # times the median; frames that take longer compile, or wait for something else
-_CHUNK = 100_000  # points and frames at a time
-_CHUNK_FRAMES = 5_000
+
+
+class _Chunks(NamedTuple):
+    """How much is written at a time."""
+
+    rows: int = 100_000  # points and frames at a time
+    frames: int = 5_000
+
+
+_CHUNKS = _Chunks()
 
 
 def write_run_folder(
@@ -256,9 +264,9 @@ def _write_files(
     frames = result.frames
     stages = sorted({name for frame in result.frames for name in frame.stages_ms})
     with (target / RunFile.FRAMES).open("w", encoding="utf-8", newline="\n") as stream:
-        for start in range(0, len(frames), _CHUNK_FRAMES):
+        for start in range(0, len(frames), _CHUNKS.frames):
             stream.write(
-                frames_csv(frames[start : start + _CHUNK_FRAMES], stages, header=start == 0)
+                frames_csv(frames[start : start + _CHUNKS.frames], stages, header=start == 0)
             )
     if save_observations:
         from vio.datasets.observation_log import write_observation_log
@@ -634,9 +642,11 @@ def write_landmarks_ply(path: Path, landmarks: Landmarks) -> None:
     )
     with path.open("wb") as stream:
         stream.write(header.encode("ascii"))
-        for start in range(0, count, _CHUNK):
-            part = slice(start, start + _CHUNK)
-            points = np.zeros(min(_CHUNK, count - start), dtype=[(name, "<f4") for name in names])
+        for start in range(0, count, _CHUNKS.rows):
+            part = slice(start, start + _CHUNKS.rows)
+            points = np.zeros(
+                min(_CHUNKS.rows, count - start), dtype=[(name, "<f4") for name in names]
+            )
             points["x"], points["y"], points["z"] = landmarks.p_world[part].T
             largest = np.linalg.eigvalsh(landmarks.covariance[part])[:, -1]
             points["sigma"] = np.sqrt(np.maximum(largest, 0.0))

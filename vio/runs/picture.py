@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -44,12 +44,20 @@ _GREEN = "#3a9d5d"
 _DEGRADED = "#e8b94a"  # behind the curves, while estimates are less certain …
 _UNUSABLE = "#d64545"  # … or not to be used
 _PURPLE = "#8a5fb0"
-# a stereo calibration that ends within so many standard deviations of zero is not drawn
-_MOVED_SIGMAS = 3.0
-_MIN_MARGIN_M = 0.02  # about a rig that stands
-_MILLIMETRES_BELOW_M = 0.02  # largest error of trajectories that are compared
-_SCALE = 1.3  # of the largest value to the end of an axis
-_BINS = 250  # of the curves that are medians over frames
+
+
+class _AxisRules(NamedTuple):
+    """What axes show."""
+
+    # a stereo calibration that ends within so many standard deviations of zero is not drawn
+    moved_sigmas: float = 3.0
+    min_margin_m: float = 0.02  # about a rig that stands
+    millimetres_below_m: float = 0.02  # largest error of trajectories that are compared
+    headroom: float = 1.3  # of the largest value to the end of an axis
+    bins: int = 250  # of the curves that are medians over frames
+
+
+_AXES = _AxisRules()
 # Of the panels, as shares of the figure and of a panel. A layout that matplotlib finds by itself
 # draws all twice.
 _MARGINS = {
@@ -191,7 +199,7 @@ def has_calibration_panel(result: RunResult) -> bool:
     if field is None:
         return False
     sigma = np.sqrt(np.diag(field.covariance))
-    return bool(np.any(np.abs(field.coefficients) > _MOVED_SIGMAS * sigma))
+    return bool(np.any(np.abs(field.coefficients) > _AXES.moved_sigmas * sigma))
 
 
 def _title(result: RunResult, evaluation: Evaluation | None) -> str:
@@ -243,7 +251,7 @@ def _view(paths: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
     """
     low = paths.min(axis=0)
     high = paths.max(axis=0)
-    size = high - low + 2 * max(0.1 * float((high - low).max()), _MIN_MARGIN_M)
+    size = high - low + 2 * max(0.1 * float((high - low).max()), _AXES.min_margin_m)
     half = 0.5 * np.array([max(size[0], shape * size[1]), max(size[1], size[0] / shape)])
     return 0.5 * (low + high) - half, 0.5 * (low + high) + half
 
@@ -262,7 +270,7 @@ def _draw_error(axes: Any, curves: Curves, dead_reckoning: Evaluation | None) ->
         axes.plot(seconds, dead_reckoning.errors_m, "--", color=_DEAD_RECKONING, lw=1.1)
     axes.set_ylabel("position error (m)")
     # dead reckoning may leave the panel
-    axes.set_ylim(0, _SCALE * max(float(curves.truth.error_m.max()), 1e-6))
+    axes.set_ylim(0, _AXES.headroom * max(float(curves.truth.error_m.max()), 1e-6))
 
 
 def _legend_above(axes: Any) -> None:
@@ -319,7 +327,10 @@ def _draw_counts(axes: Any, seconds: FloatArray, frames: Rows) -> None:
         ("used", _ESTIMATE),
     ):
         axes.plot(
-            *binned(seconds, frames[name], _BINS), color=colour, lw=1.2, label=FEATURE_WORDS[name]
+            *binned(seconds, frames[name], _AXES.bins),
+            color=colour,
+            lw=1.2,
+            label=FEATURE_WORDS[name],
         )
     axes.set_ylabel("features")
     axes.set_ylim(bottom=0)
@@ -327,8 +338,8 @@ def _draw_counts(axes: Any, seconds: FloatArray, frames: Rows) -> None:
 
 
 def _draw_time(axes: Any, seconds: FloatArray, frames: Rows) -> None:
-    times, _ = binned(seconds, seconds, _BINS)
-    medians = [binned(seconds, frames[f"{stage}_ms"], _BINS)[1] for stage in STAGES]
+    times, _ = binned(seconds, seconds, _AXES.bins)
+    medians = [binned(seconds, frames[f"{stage}_ms"], _AXES.bins)[1] for stage in STAGES]
     axes.stackplot(times, medians, labels=STAGES, colors=STAGE_COLOURS, linewidth=0)
     axes.set_ylabel("time (ms)")
     # frames that compile leave the panel
@@ -416,7 +427,7 @@ def _compare_curves(
     values, label = COMPARED_COLUMNS[column]
     largest = max(float(r.errors_m.max()) for r in results.values())
     factor = 1.0
-    if column == "position" and largest < _MILLIMETRES_BELOW_M:
+    if column == "position" and largest < _AXES.millimetres_below_m:
         factor = 1e3
         label = label.replace("(m)", "(mm)")
     for (name, r), colour in zip(results.items(), itertools.cycle(COLOURS), strict=False):

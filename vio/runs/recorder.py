@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -62,8 +62,16 @@ from vio.runs.tables import (
 log = logging.getLogger(__name__)
 
 _TEXTS = (RunFile.TRAJECTORY, RunFile.FRAMES)  # that grow
-_FLUSH_S = 1.0
-_CHECKPOINT_S = 5.0
+
+
+class _WriteTimes(NamedTuple):
+    """When files are written."""
+
+    flush_s: float = 1.0
+    checkpoint_s: float = 5.0
+
+
+_TIMES = _WriteTimes()
 _CHUNK = 100_000  # points at a time
 _POSE = np.dtype([("T", "<f8", (4, 4))])
 _TABLES = {
@@ -161,7 +169,7 @@ class RunRecorder:
                 self._tables["seen"].append(
                     np.array([(seen.frame_index, seen.time_ns, len(seen))], dtype=SEEN)
                 )
-        if time.monotonic() - self._flushed_s > _FLUSH_S:
+        if time.monotonic() - self._flushed_s > _TIMES.flush_s:
             self.flush()
 
     def revise(self, smoothed: Smoothed, first: int = 0, end: int | None = None) -> None:
@@ -323,7 +331,7 @@ class RunRecorder:
     @property
     def is_save_due(self) -> bool:
         """Whether it is time for a checkpoint."""
-        return self.can_save and time.monotonic() - self._saved_s > _CHECKPOINT_S
+        return self.can_save and time.monotonic() - self._saved_s > _TIMES.checkpoint_s
 
     def save(self, state: Any, dataset: Dataset, finished: Landmarks) -> None:
         """Write a checkpoint of a run's state, less the recording, where `can_save` says so.

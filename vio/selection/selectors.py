@@ -9,7 +9,7 @@ camera's motion. docs/notes/selection.md compares them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -27,10 +27,17 @@ from vio.selection.information import (
 )
 from vio.setting import Section, setting
 
-_MIN_KEPT = 12  # observations of a frame, where a share of them is kept
-# the gain is summed over the last motion, the next one and the one so many frames ahead
-_HORIZON_FRAMES = 4
-_PIXEL_SIGMA_PX = 0.5  # standard deviation of one pixel coordinate
+
+class _SelectionRules(NamedTuple):
+    """Which observations are kept."""
+
+    min_kept: int = 12  # observations of a frame, where a share of them is kept
+    # the gain is summed over the last motion, the next one and the one so many frames ahead
+    horizon_frames: int = 4
+    pixel_sigma_px: float = 0.5  # standard deviation of one pixel coordinate
+
+
+_SELECTION = _SelectionRules()
 
 SelectorName = Literal["all", "visibility", "visibility_whole", "information"]
 
@@ -78,7 +85,10 @@ class _VisibilityCount:
 def _budget(s: SelectorSettings, n: int) -> int:
     """Return how many of n rows may be chosen."""
     return min(
-        n, max(int(np.ceil(n * s.keep_fraction)), _MIN_KEPT) if s.budget is None else s.budget
+        n,
+        max(int(np.ceil(n * s.keep_fraction)), _SELECTION.min_kept)
+        if s.budget is None
+        else s.budget,
     )
 
 
@@ -150,7 +160,9 @@ class InformationGain:
 
     def __init__(self, settings: SelectorSettings, camera: StereoCamera) -> None:
         self._settings = settings
-        self._model = MotionInformation(camera, _HORIZON_FRAMES, _PIXEL_SIGMA_PX)
+        self._model = MotionInformation(
+            camera, _SELECTION.horizon_frames, _SELECTION.pixel_sigma_px
+        )
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose rows greedily by their gain in the log-determinant."""

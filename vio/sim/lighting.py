@@ -9,17 +9,26 @@ texture's gray levels as they are.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray
 
-# illumination right at a window; the model of a small source would go to infinity there
-_BRIGHTEST = 3.0
-_WRAP = 0.35  # share of a window's light that arrives from around it, off the walls beside it
-# a shadow's ray begins so far off its surface, outside the surface's own box
-_SHADOW_START_M = 0.01
+
+class _LightRules(NamedTuple):
+    """How light falls."""
+
+    # illumination right at a window; the model of a small source would go to infinity there
+    max_factor: float = 3.0
+    # share of a window's light that arrives from around it, off the walls beside it
+    wrap_share: float = 0.35
+    # a shadow's ray begins so far off its surface, outside the surface's own box
+    shadow_start_m: float = 0.01
+
+
+_LIGHT = _LightRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,18 +67,18 @@ def illumination(lighting: Lighting, points: npt.ArrayLike, normal: npt.ArrayLik
                 total += (
                     light.power
                     * facing
-                    * _sunlit(lighting, p + _SHADOW_START_M * n, light.position)
+                    * _sunlit(lighting, p + _LIGHT.shadow_start_m * n, light.position)
                 )
             continue
         towards = light.position - p
         square = np.einsum("ni,ni->n", towards, towards)
         ray = towards / np.sqrt(np.maximum(square, 1e-12))[:, None]
-        received = _WRAP + (1 - _WRAP) * (ray @ n)
-        sent = _WRAP + (1 - _WRAP) * -(ray @ light.normal)
+        received = _LIGHT.wrap_share + (1 - _LIGHT.wrap_share) * (ray @ n)
+        sent = _LIGHT.wrap_share + (1 - _LIGHT.wrap_share) * -(ray @ light.normal)
         total += (
             light.power * np.maximum(received, 0) * np.maximum(sent, 0) / np.maximum(square, 1e-2)
         )
-    return np.minimum(total, _BRIGHTEST + lighting.ambient)
+    return np.minimum(total, _LIGHT.max_factor + lighting.ambient)
 
 
 def _sunlit(lighting: Lighting, points: FloatArray, direction: FloatArray) -> FloatArray:

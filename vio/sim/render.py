@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -28,15 +28,24 @@ from vio.sim.world import Surfaces, World, surfaces_at
 
 Radiance: TypeAlias = npt.NDArray[np.float32]
 
-_TILE = 64  # pixels
-_COARSE = 2  # tiles along a coarse tile
+
+class _RenderRules(NamedTuple):
+    """Accuracy and memory of the rays."""
+
+    tile_px: int = 64  # pixels
+    coarse_tiles: int = 2  # tiles along a coarse tile
+    detail_step_px: int = 4  # pixels between evaluations of the level of detail
+    min_front_m: float = 1e-6
+    same_point_share: float = 1e-6  # relative distance within which two hits are the same point
+    max_pairs: int = 400_000  # rays times surfaces held in memory at once
+    # ratio of footprint sides from which the longer one gets twice the samples
+    stretched_ratio: float = 2.0
+
+
+_RENDER = _RenderRules()
 _EDGE_MARK = np.int16(-1)
 _NONE = np.int16(-2)
 _EMPTY = np.float32(90.0)  # gray level where no surface is hit
-_LOD_STEP = 4  # pixels between evaluations of the level of detail
-_MIN_FRONT_M = 1e-6
-_SAME_POINT = 1e-6  # relative distance within which two hits are the same point
-_CAST_PAIRS = 400_000  # rays times surfaces held in memory at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +101,8 @@ def camera_rays(camera: CameraModel) -> CameraRays:
         camera,
         np.ascontiguousarray(np.moveaxis(centre, -1, 0), dtype=np.float32),
         np.ascontiguousarray(np.moveaxis(corner, -1, 0), dtype=np.float32),
-        _cones(corner, _TILE),
-        _cones(corner, _TILE * _COARSE),
+        _cones(corner, _RENDER.tile_px),
+        _cones(corner, _RENDER.tile_px * _RENDER.coarse_tiles),
     )
 
 
@@ -147,7 +156,7 @@ def _surface_matrices(surfaces: Surfaces, T_world_cam: FloatArray) -> tuple[Floa
     from_corner = c - surfaces.origin
     normal = surfaces.normal
     h = np.einsum("si,si->s", normal, from_corner)
-    front = np.flatnonzero(h > _MIN_FRONT_M)
+    front = np.flatnonzero(h > _RENDER.min_front_m)
     w = -normal[front] / h[front, None]
     rows = []
     for axis in (surfaces.axis_s[front], surfaces.axis_t[front]):
@@ -168,7 +177,7 @@ def cast(surfaces: Surfaces, T_world_cam: npt.ArrayLike, rays: npt.ArrayLike) ->
     d = np.asarray(rays, dtype=np.float64).reshape(-1, 3)
     G, index = _surface_matrices(surfaces, np.asarray(T_world_cam, dtype=np.float64))
     size = surfaces.size[index]
-    rows = max(1, _CAST_PAIRS // max(1, len(index)))
+    rows = max(1, _RENDER.max_pairs // max(1, len(index)))
     parts = [_cast_block(G, index, size, d[i : i + rows]) for i in range(0, max(len(d), 1), rows)]
     return Hits(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
@@ -240,7 +249,8 @@ def observe(surfaces: Surfaces, view: View, p_world: npt.ArrayLike) -> tuple[Flo
     # For a point seen from behind its surface, the ray hits nothing at its distance, or another
     # surface in front.
     reached = hits.found & (
-        np.abs(hits.distance - distance[visible]) < _SAME_POINT * (1 + distance[visible])
+        np.abs(hits.distance - distance[visible])
+        < _RENDER.same_point_share * (1 + distance[visible])
     )
     visible[visible] = reached
     return uv, visible
@@ -275,8 +285,8 @@ def depth_map(
     candidates = _candidates(G, surfaces.size[index], rays)
     uv = _grid(width, height, 0.0)
     for r, c in np.ndindex(candidates.shape[:2]):
-        rows = slice(r * _TILE, (r + 1) * _TILE)
-        columns = slice(c * _TILE, (c + 1) * _TILE)
+        rows = slice(r * _RENDER.tile_px, (r + 1) * _RENDER.tile_px)
+        columns = slice(c * _RENDER.tile_px, (c + 1) * _RENDER.tile_px)
         d, _ = unproject_pixel(rays.camera, uv[rows, columns].reshape(-1, 2))
         chosen = candidates[r, c]
         which, distance, _, found = _cast_block(
@@ -299,11 +309,18 @@ def _candidates(G: FloatArray, size: FloatArray, rays: CameraRays) -> BoolArray:
     out = np.zeros((rows, columns, len(G)), dtype=np.bool_)
     for r, c in np.ndindex(coarse.shape[:2]):
         chosen = np.flatnonzero(coarse[r, c])
-        block = rays.fine[r * _COARSE : (r + 1) * _COARSE, c * _COARSE : (c + 1) * _COARSE]
+        block = rays.fine[
+            r * _RENDER.coarse_tiles : (r + 1) * _RENDER.coarse_tiles,
+            c * _RENDER.coarse_tiles : (c + 1) * _RENDER.coarse_tiles,
+        ]
         kept = _cull(G[chosen], size[chosen], block.reshape(-1, 4, 3)).reshape(
             *block.shape[:2], len(chosen)
         )
-        out[r * _COARSE : (r + 1) * _COARSE, c * _COARSE : (c + 1) * _COARSE, chosen] = kept
+        out[
+            r * _RENDER.coarse_tiles : (r + 1) * _RENDER.coarse_tiles,
+            c * _RENDER.coarse_tiles : (c + 1) * _RENDER.coarse_tiles,
+            chosen,
+        ] = kept
     return out
 
 
@@ -359,7 +376,7 @@ def render(
     for r in range(candidates.shape[0]):
         shown = _shown(scene, candidates[r], rays, r)
         _shade_row(scene, shown, candidates[r], rays, r, image)
-        edges.append(np.argwhere(shown == _EDGE_MARK) + np.array([r * _TILE, 0]))
+        edges.append(np.argwhere(shown == _EDGE_MARK) + np.array([r * _RENDER.tile_px, 0]))
     _shade_edges(scene, candidates, rays, np.concatenate(edges), image)
     return image
 
@@ -368,11 +385,11 @@ def _shown(scene: _Scene, candidates: BoolArray, rays: CameraRays, r: int) -> np
     """The one surface visible in each pixel (h, W) of a row of tiles, _EDGE_MARK on outlines, or
     _NONE.
     """
-    rows = slice(r * _TILE, min((r + 1) * _TILE, rays.camera.height))
+    rows = slice(r * _RENDER.tile_px, min((r + 1) * _RENDER.tile_px, rays.camera.height))
     out = np.full((rows.stop - rows.start, rays.camera.width), _NONE, dtype=np.int16)
     for c, allowed in enumerate(candidates):
         chosen = np.flatnonzero(allowed)
-        columns = slice(c * _TILE, min((c + 1) * _TILE, rays.camera.width))
+        columns = slice(c * _RENDER.tile_px, min((c + 1) * _RENDER.tile_px, rays.camera.width))
         if len(chosen) == 1:
             out[:, columns] = chosen[0]
         elif len(chosen) > 1:
@@ -408,13 +425,13 @@ def _shade_row(
     """Shade the pixels of a row of tiles that show one surface only, surface by surface in runs
     of columns.
     """
-    top = r * _TILE
+    top = r * _RENDER.tile_px
     # Sample positions within a pixel follow the ray derivative at the middle of a run of tiles.
-    longest = rays.camera.lens.linear_tiles * _TILE
+    longest = rays.camera.lens.linear_tiles * _RENDER.tile_px
     for k in np.flatnonzero(np.bincount(shown[shown >= 0], minlength=1)):
         tiles = np.flatnonzero(candidates[:, k])
-        left = int(tiles[0]) * _TILE
-        right = (int(tiles[-1]) + 1) * _TILE
+        left = int(tiles[0]) * _RENDER.tile_px
+        right = (int(tiles[-1]) + 1) * _RENDER.tile_px
         mask = shown[:, left:right] == k
         for first, last in _runs(np.flatnonzero(mask.any(axis=0)), longest):
             columns = slice(left + first, left + last)
@@ -436,7 +453,7 @@ def _runs(seen: npt.NDArray[np.intp], longest: int) -> Iterator[tuple[int, int]]
     """Intervals [first, last) that cover all given columns, without wide gaps and at most
     `longest` long.
     """
-    cuts = np.flatnonzero(np.diff(seen) > _TILE) + 1
+    cuts = np.flatnonzero(np.diff(seen) > _RENDER.tile_px) + 1
     for part in np.split(seen, cuts):
         first = int(part[0])
         end = int(part[-1]) + 1
@@ -469,7 +486,6 @@ _QUEENS = (2, 4, 1, 7, 0, 6, 3, 5)
 _FINE = np.array(
     [((i + 0.5) / 8 - 0.5, (j + 0.5) / 8 - 0.5) for i, j in enumerate(_QUEENS)], dtype=np.float32
 )
-_STRETCHED = 2.0  # ratio of footprint sides from which the longer one gets twice the samples
 
 
 def _footprint(
@@ -508,13 +524,15 @@ def _shade(scene: _Scene, k: int, rays: CameraRays, rows: slice, columns: slice)
     g_u = G @ (corner[:, 0, 1] - corner[:, 0, 0])
     g_v = G @ (corner[:, 1, 0] - corner[:, 0, 0])
     forms = G @ d.reshape(3, -1)
-    along_u, along_v = _footprint(forms.reshape(3, h, w)[:, ::_LOD_STEP, ::_LOD_STEP], g_u, g_v)
+    along_u, along_v = _footprint(
+        forms.reshape(3, h, w)[:, :: _RENDER.detail_step_px, :: _RENDER.detail_step_px], g_u, g_v
+    )
     middle = along_u.shape[0] // 2, along_u.shape[1] // 2
     ratio = along_u[middle] / max(along_v[middle], 1e-30)
-    if ratio > _STRETCHED**2:
+    if ratio > _RENDER.stretched_ratio**2:
         offsets = _WIDE
         square = np.maximum(along_u / 16, along_v / 4)
-    elif ratio < 1 / _STRETCHED**2:
+    elif ratio < 1 / _RENDER.stretched_ratio**2:
         offsets = _TALL
         square = np.maximum(along_u / 4, along_v / 16)
     else:
@@ -535,7 +553,9 @@ def _shade(scene: _Scene, k: int, rays: CameraRays, rows: slice, columns: slice)
         else:
             table = np.moveaxis(texture.levels[level], -1, 0)
             grown = (
-                table.repeat(_LOD_STEP, axis=1).repeat(_LOD_STEP, axis=2)[:, :h, :w].reshape(4, -1)
+                table.repeat(_RENDER.detail_step_px, axis=1)
+                .repeat(_RENDER.detail_step_px, axis=2)[:, :h, :w]
+                .reshape(4, -1)
             )
             scale_x, scale_y, shift_x, shift_y = grown
         x[half] *= scale_x
@@ -564,7 +584,7 @@ def _shade_edges(
     if len(v) == 0:
         return
     n = len(_FINE)
-    allowed = candidates[v // _TILE, u // _TILE]
+    allowed = candidates[v // _RENDER.tile_px, u // _RENDER.tile_px]
     first = rays.corner[:, v, u]
     du = rays.corner[:, v, u + 1] - first  # (3, E)
     dv = rays.corner[:, v + 1, u] - first

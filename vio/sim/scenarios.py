@@ -14,7 +14,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
@@ -72,12 +72,20 @@ RIGS: dict[str, Callable[[], StereoRig]] = {
     "small": small_rig,
 }
 _EUROC_AXES = ("euroc", "euroc-rectified")  # rigs whose IMU axes are up, right, forward
-# of motion before the first and after the last frame, for shutters and clock offsets
-_MARGIN_S = 0.25
+
+
+class _Scene(NamedTuple):
+    """Sizes of what the scenarios have in common."""
+
+    # of motion before the first and after the last frame, for shutters and clock offsets
+    margin_s: float = 0.25
+    lead_m: float = 14.0  # to the car ahead
+    windows: int = 2  # of a room with lighting
+    wall_gap_m: float = 0.4  # from a wall to the middle of a box that moves along it
+
+
+_SCENE = _Scene()
 _AHEAD = 3  # pending frames per process
-_LEAD_M = 14.0  # to the car ahead
-_WINDOWS = 2  # of a room with lighting
-_WALL_GAP_M = 0.4  # from a wall to the middle of a box that moves along it
 
 FLIGHT_FILES = ("groundtruth_tum.txt", "image_timestamps_ns.txt", "imu0.csv")
 
@@ -306,8 +314,8 @@ def _ready(scenario: Scenario) -> tuple[MotionSpline, IntArray, None]:
         )
     duration_s = 30.0 if scenario.duration_s is None else scenario.duration_s
     # A whole number of frame periods, so that sensors of that rate sample at the frame times.
-    before = math.ceil(_MARGIN_S * scenario.rate_hz)
-    motion = _motion(scenario, duration_s + before / scenario.rate_hz + _MARGIN_S)
+    before = math.ceil(_SCENE.margin_s * scenario.rate_hz)
+    motion = _motion(scenario, duration_s + before / scenario.rate_hz + _SCENE.margin_s)
     if scenario.rig in _EUROC_AXES:
         motion = rotate_body_axes(motion, R_FLU_EUROC_IMU)
     return motion, _regular(motion.start_ns, duration_s, scenario.rate_hz, first=before), None
@@ -387,7 +395,7 @@ def _scene(
         sides = ("+y", "-y") if hard.bare_wall else ("+y",)
         return corridor(seed, bare_walls=sides, bare_kind=bare, moving=moving)
     walls = ("+x", "+y") if hard.bare_wall else ()
-    windows = _WINDOWS if hard.lighting else 0
+    windows = _SCENE.windows if hard.lighting else 0
     inside = functools.partial(
         room, seed, bare_walls=walls, bare_kind=bare, moving=moving, windows=windows
     )
@@ -420,8 +428,8 @@ def _moving_boxes(scenario: Scenario, motion: MotionSpline, empty: World) -> tup
 
 def _boxes_along_walls(world: World, motion: MotionSpline) -> tuple[MovingBox, ...]:
     """Boxes that move back and forth along the four walls, clear of all camera trajectories."""
-    low = world.bounds[0] + _WALL_GAP_M
-    high = world.bounds[1] - _WALL_GAP_M
+    low = world.bounds[0] + _SCENE.wall_gap_m
+    high = world.bounds[1] - _SCENE.wall_gap_m
     z = (world.bounds[0, 2] + world.bounds[1, 2]) / 2
     corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
     lanes = [np.array([[*corners[i], z], [*corners[(i + 1) % 4], z]]) for i in range(4)]
@@ -442,7 +450,11 @@ def _traffic(motion: MotionSpline, seed: int) -> tuple[MovingBox, ...]:
     """A car ahead in the same lane, and an oncoming one that circles the inner lane."""
     seconds = (motion.end_ns - motion.start_ns) / NS_PER_S
     ahead = car_loop(
-        duration_s=seconds, start_m=_LEAD_M, height_m=0.85, seed=seed, start_ns=motion.start_ns
+        duration_s=seconds,
+        start_m=_SCENE.lead_m,
+        height_m=0.85,
+        seed=seed,
+        start_ns=motion.start_ns,
     )
     inner = car_loop(loop_m=(103.6, 63.6), corner_m=5.0, height_m=0.85, seed=seed + 1)
     loop_ns = inner.end_ns - inner.start_ns

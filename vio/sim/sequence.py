@@ -9,6 +9,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -59,9 +60,17 @@ from vio.sim.world import World, check_clear, room
 logger = logging.getLogger(__name__)
 
 _CLEARANCE_STEP_NS = 20_000_000
-_FLOW_GRID = 16  # pixels between exact flow vectors of the approximate blur
-_TAP_SPACING_PX = 1.2  # between samples along a blur; linear interpolation fills the gaps
-_MAX_TAPS = 21
+
+
+class _BlurRules(NamedTuple):
+    """How blur is approximated."""
+
+    flow_grid_px: int = 16  # pixels between exact flow vectors of the approximate blur
+    tap_spacing_px: float = 1.2  # between samples along a blur; linear interpolation fills the gaps
+    max_taps: int = 21
+
+
+_BLUR = _BlurRules()
 _WALL_MARGIN_M = 1.2  # of a room built around a recorded flight
 
 
@@ -393,11 +402,11 @@ class SimulatedRecording:
         # short shutters need fewer taps, and long ones leave no gaps between them
         if effects.auto_exposure:
             length = max(float(np.abs(before).max()), float(np.abs(after).max()))
-            taps = int(np.clip(2 * round(length / _TAP_SPACING_PX) + 1, 1, _MAX_TAPS))
+            taps = int(np.clip(2 * round(length / _BLUR.tap_spacing_px) + 1, 1, _BLUR.max_taps))
         return blur_along_flow(self._sharp(camera, time_ns), before, after, taps)
 
     def flow(
-        self, camera: int, from_ns: int, to_ns: int, *, step_px: int = _FLOW_GRID
+        self, camera: int, from_ns: int, to_ns: int, *, step_px: int = _BLUR.flow_grid_px
     ) -> FloatArray:
         """Optical flow (H, W, 2) of one camera between two true times, exact on a grid and
         interpolated between nodes.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -24,12 +24,20 @@ TextureKind: TypeAlias = Literal[
 ]  # fmt: skip
 _Canvas: TypeAlias = npt.NDArray[np.float32]
 
-_GUTTER = 3  # texels of repeated border around each level, for the interpolation kernel
-_MAX_SIDE = 32000  # cv2.remap addresses its source with 16-bit integers
-_SMALLEST_LEVEL = 4
-_MAX_MARKS = 6000  # of one kind on one surface
+
+class _TextureRules(NamedTuple):
+    """Sizes of textures."""
+
+    # texels of repeated border around each level, for the interpolation kernel
+    gutter_texels: int = 3
+    max_side_texels: int = 32000  # cv2.remap addresses its source with 16-bit integers
+    min_level_texels: int = 4
+    max_marks: int = 6000  # of one kind on one surface
+    coarse_texels: int = 16  # of the shorter side of the copy that exposure is metered on
+
+
+_TEXTURE = _TextureRules()
 LEVELS_PER_OCTAVE = 2
-_COARSE_TEXELS = 16  # of the shorter side of the copy that exposure is metered on
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +55,9 @@ class MipTexture:
         texels small.
         """
         sizes = self.levels[:, :2] * self.size  # texels of each level
-        level = self.levels[int(np.argmin(np.abs(np.log2(sizes.min(axis=1) / _COARSE_TEXELS))))]
+        level = self.levels[
+            int(np.argmin(np.abs(np.log2(sizes.min(axis=1) / _TEXTURE.coarse_texels))))
+        ]
         x, y = (np.clip(share, 0, 1) * self.size * level[:2] + level[2:]).T
         height, width = self.page.shape
         column = np.clip(np.rint(x), 0, width - 1).astype(int)
@@ -62,13 +72,13 @@ def build_mips(texture: Image) -> MipTexture:
     the page.
     """
     height, width = texture.shape
-    if width > _MAX_SIDE:
+    if width > _TEXTURE.max_side_texels:
         raise SimulationError(
             f"a texture of {width} texels is too wide; choose a coarser texel size"
         )
     levels = [texture]
     step = 0
-    while min(levels[-1].shape) > _SMALLEST_LEVEL:
+    while min(levels[-1].shape) > _TEXTURE.min_level_texels:
         step += 1
         scale = 2.0 ** (-step / LEVELS_PER_OCTAVE)
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -84,13 +94,13 @@ def build_mips(texture: Image) -> MipTexture:
 
 def _pack(levels: list[Image]) -> MipTexture:
     """Place the levels on shelves: the widest decides the page, smaller ones fill the gaps."""
-    page_width = levels[0].shape[1] + 2 * _GUTTER
+    page_width = levels[0].shape[1] + 2 * _TEXTURE.gutter_texels
     shelves: list[list[int]] = []  # top, height, filled width
     places: list[tuple[int, int]] = []
     bottom = 0
     for level in levels:
-        h = level.shape[0] + 2 * _GUTTER
-        w = level.shape[1] + 2 * _GUTTER
+        h = level.shape[0] + 2 * _TEXTURE.gutter_texels
+        w = level.shape[1] + 2 * _TEXTURE.gutter_texels
         shelf = next((s for s in shelves if h <= s[1] and s[2] + w <= page_width), None)
         if shelf is None:
             shelf = [bottom, h, 0]
@@ -98,7 +108,7 @@ def _pack(levels: list[Image]) -> MipTexture:
             bottom += h
         places.append((shelf[0], shelf[2]))
         shelf[2] += w
-    if bottom > _MAX_SIDE:
+    if bottom > _TEXTURE.max_side_texels:
         raise SimulationError(
             f"a texture page of {bottom} rows is too tall; choose a coarser texel size"
         )
@@ -106,14 +116,21 @@ def _pack(levels: list[Image]) -> MipTexture:
     rows = []
     height, width = levels[0].shape
     for level, (top, left) in zip(levels, places, strict=True):
-        padded = cv2.copyMakeBorder(level, _GUTTER, _GUTTER, _GUTTER, _GUTTER, cv2.BORDER_REPLICATE)
+        padded = cv2.copyMakeBorder(
+            level,
+            _TEXTURE.gutter_texels,
+            _TEXTURE.gutter_texels,
+            _TEXTURE.gutter_texels,
+            _TEXTURE.gutter_texels,
+            cv2.BORDER_REPLICATE,
+        )
         page[top : top + padded.shape[0], left : left + padded.shape[1]] = padded
         rows.append(
             (
                 level.shape[1] / width,
                 level.shape[0] / height,
-                left + _GUTTER - 0.5,
-                top + _GUTTER - 0.5,
+                left + _TEXTURE.gutter_texels - 0.5,
+                top + _TEXTURE.gutter_texels - 0.5,
             )
         )
     return MipTexture(page, (width, height), np.array(rows, dtype=np.float32))
@@ -233,7 +250,7 @@ def _scatter(
     for low, high, weight in ((0.15, 0.5, 1.5), (0.05, 0.15, 8.0), (0.015, 0.05, 30.0)):
         if high * per_m < 2.5:
             continue
-        count = min(int(area * density * weight), 2 * _MAX_MARKS)
+        count = min(int(area * density * weight), 2 * _TEXTURE.max_marks)
         sides = (low * per_m, high * per_m)
         _rectangles(canvas, rng, count // 2, sides, contrast)
         _polygons(canvas, rng, count - count // 2, (sides[0] / 2, sides[1] / 2), contrast)
@@ -454,13 +471,19 @@ def _asphalt(width: int, height: int, per_m: float, rng: np.random.Generator) ->
     canvas = 95 + 24 * _noise(width, height, per_m, rng, 4.0, 0.92)
     canvas = np.ascontiguousarray(canvas, dtype=np.float32)
     area = width * height / per_m**2
-    _rectangles(canvas, rng, min(int(area / 12), _MAX_MARKS), (0.4 * per_m, 3.0 * per_m), 22)
-    _polygons(canvas, rng, min(int(area / 3), _MAX_MARKS), (0.05 * per_m, 0.4 * per_m), 45)
+    _rectangles(
+        canvas, rng, min(int(area / 12), _TEXTURE.max_marks), (0.4 * per_m, 3.0 * per_m), 22
+    )
+    _polygons(canvas, rng, min(int(area / 3), _TEXTURE.max_marks), (0.05 * per_m, 0.4 * per_m), 45)
     if 0.08 * per_m > 2:
         _polygons(
-            canvas, rng, min(int(area * 2.5), 2 * _MAX_MARKS), (0.02 * per_m, 0.08 * per_m), 70
+            canvas,
+            rng,
+            min(int(area * 2.5), 2 * _TEXTURE.max_marks),
+            (0.02 * per_m, 0.08 * per_m),
+            70,
         )
-    for _ in range(min(int(area / 8), _MAX_MARKS)):
+    for _ in range(min(int(area / 8), _TEXTURE.max_marks)):
         steps = rng.normal(0, 0.35, (12, 2)).cumsum(axis=0) * per_m
         points = rng.uniform((0, 0), (width, height)) + steps
         dark = float(rng.uniform(25, 55))
@@ -472,7 +495,7 @@ def _asphalt(width: int, height: int, per_m: float, rng: np.random.Generator) ->
             max(1, round(0.02 * per_m)),
             shift=4,
         )
-    for _ in range(min(int(area / 25), _MAX_MARKS)):
+    for _ in range(min(int(area / 25), _TEXTURE.max_marks)):
         x, y = rng.uniform((0, 0), (width, height))
         _fill(
             canvas,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,8 +35,16 @@ _STREAMS = _Streams()
 # of OpenCV's rational polynomial; the device stores thin prisms and tilt behind them
 _COEFFICIENTS = 8
 _FISHEYE_COEFFICIENTS = 4
-_PAUSE_S = 0.002
-_LOST_S = 5.0
+
+
+class _Waits(NamedTuple):
+    """How long a camera is waited for."""
+
+    pause_s: float = 0.002
+    lost_s: float = 5.0
+
+
+_WAITS = _Waits()
 
 
 class OakSource:
@@ -181,9 +189,9 @@ class OakSource:
             if came:
                 last_s = time.monotonic()
                 continue
-            if time.monotonic() - last_s > _LOST_S:
-                raise DataError(f"{self._name}: nothing for {_LOST_S:.0f} s; check the cable")
-            time.sleep(_PAUSE_S)
+            if time.monotonic() - last_s > _WAITS.lost_s:
+                raise DataError(f"{self._name}: nothing for {_WAITS.lost_s:.0f} s; check the cable")
+            time.sleep(_WAITS.pause_s)
             yield None
 
     def close(self) -> None:

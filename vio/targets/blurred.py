@@ -10,6 +10,8 @@ compositional algorithm, with gain and offset of the gray values.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.geometry.lie import FloatArray
@@ -19,24 +21,40 @@ from vio.targets.description import Target
 from vio.targets.homography import mapped
 from vio.targets.printing import printed_light
 
-_TEXELS = 8  # a module
-_MAX_TEXTURE_PX = 4096
-_MARGIN = 0.1  # of a tag or square: paper around the print, which is known to be light
-_FINER = 2  # samples along a side of a pixel, where blur is below
-_FINE_BELOW_PX = 1.8
-_APRON_SIGMAS = 3.0
-_MIN_HALF_PX = 6  # half the side of the window that is aligned
-_MAX_HALF_PX = 24
-_HALF_SHARE = 0.5  # of a tag's or square's side
-_HALF_SIGMAS = 2.0
-_WINDOW_SHARE = 0.6  # of the half side: standard deviation of the weights
-_STEPS = 12
-_MAX_STEP_PX = 1.5
-_CONVERGED_PX = 1e-3
-_AT_ONCE = 64  # corners that are drawn in one image
-_MIN_KNOWN = 0.3  # of a window's weight
+
+class _PrintRules(NamedTuple):
+    """How the blurred print is drawn."""
+
+    module_texels: int = 8  # a module
+    max_texture_px: int = 4096
+    # of a tag or square: paper around the print, which is known to be light
+    margin_share: float = 0.1
+    finer_samples: int = 2  # samples along a side of a pixel, where blur is below
+    fine_below_px: float = 1.8
+    apron_sigmas: float = 3.0
+    corners_at_once: int = 64  # corners that are drawn in one image
+
+
+_PRINT = _PrintRules()
+
+
+class _WindowRules(NamedTuple):
+    """The window that is aligned, and its alignment."""
+
+    min_half_px: int = 6  # half the side of the window that is aligned
+    max_half_px: int = 24
+    half_share: float = 0.5  # of a tag's or square's side
+    half_sigmas: float = 2.0
+    weight_share: float = 0.6  # of the half side: standard deviation of the weights
+    iterations: int = 12
+    max_step_px: float = 1.5
+    converged_px: float = 1e-3
+    min_known_share: float = 0.3  # of a window's weight
+    tried_corners: int = 12
+
+
+_WINDOW = _WindowRules()
 _BLURS_PX = (0.7, 1.4, 2.0, 2.8, 4.0, 5.6)  # that are tried
-_TRIED_CORNERS = 12
 
 
 class PrintAligner:
@@ -46,9 +64,11 @@ class PrintAligner:
         self._target = target
         self._points = target.points_m
         module = target.size_m / (10 if target.kind == "aprilgrid" else 16)
-        self._margin_m = _MARGIN * target.size_m
+        self._margin_m = _PRINT.margin_share * target.size_m
         longest = max(target.extent_m) + 2 * self._margin_m
-        self._texels = min(_TEXELS / module, _MAX_TEXTURE_PX / longest)  # a metre
+        self._texels = min(
+            _PRINT.module_texels / module, _PRINT.max_texture_px / longest
+        )  # a metre
         self._light = printed_light(target, self._texels, self._margin_m).astype(np.float32)
 
     def aligned(
@@ -69,7 +89,7 @@ class PrintAligner:
         halves = self._half_sides(uv, H, ids, sigma_px)
         for half in np.unique(halves).tolist():
             rows = np.flatnonzero(halves == half)
-            for part in np.array_split(rows, -(-len(rows) // _AT_ONCE)):
+            for part in np.array_split(rows, -(-len(rows) // _PRINT.corners_at_once)):
                 out[part], like[part] = self._aligned(image, uv[part], H[part], half, sigma_px)
         return out, like
 
@@ -77,7 +97,7 @@ class PrintAligner:
         """Return the standard deviation in pixels of an image's blur: that by which the print
         agrees best with the image around corners (K,), see `aligned`.
         """
-        few = np.linspace(0, len(ids) - 1, min(len(ids), _TRIED_CORNERS)).astype(int)
+        few = np.linspace(0, len(ids) - 1, min(len(ids), _WINDOW.tried_corners)).astype(int)
         best = -1.0
         found = _BLURS_PX[0]
         for sigma in _BLURS_PX:
@@ -95,8 +115,10 @@ class PrintAligner:
         step = self._target.size_m
         around = self._points[ids][:, None] + step * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
         side = np.linalg.norm(mapped(H, around) - uv[:, None], axis=2).mean(axis=1)
-        half = np.maximum(_HALF_SHARE * side, _HALF_SIGMAS * sigma_px)
-        return np.asarray(2 * np.rint(0.5 * np.clip(half, _MIN_HALF_PX, _MAX_HALF_PX)), np.int64)
+        half = np.maximum(_WINDOW.half_share * side, _WINDOW.half_sigmas * sigma_px)
+        return np.asarray(
+            2 * np.rint(0.5 * np.clip(half, _WINDOW.min_half_px, _WINDOW.max_half_px)), np.int64
+        )
 
     def _aligned(
         self, image: Image, uv: FloatArray, H: FloatArray, half: int, sigma_px: float
@@ -119,7 +141,7 @@ class PrintAligner:
         shape = np.tile(np.eye(2), (len(uv), 1, 1))
         values = np.zeros_like(light)
         limit = max(0.5 * half, 1.0)
-        for _ in range(_STEPS):
+        for _ in range(_WINDOW.iterations):
             place = (at[:, None] + window @ np.swapaxes(shape, 1, 2)).astype(np.float32)
             sampled = cv2.remap(
                 image,
@@ -132,10 +154,10 @@ class PrintAligner:
             found = np.linalg.solve(normal, np.einsum("ksp,ks->kp", WA, values)[..., None])[..., 0]
             # The image is the print moved by d: its values are gain (light + d . gradient).
             gain = np.where(np.abs(found[:, 6]) < 1e-3, 1e-3, found[:, 6])
-            step = np.clip(found[:, :6] / gain[:, None], -_MAX_STEP_PX, _MAX_STEP_PX)
+            step = np.clip(found[:, :6] / gain[:, None], -_WINDOW.max_step_px, _WINDOW.max_step_px)
             at = np.clip(at - step[:, :2], uv - limit, uv + limit)
             shape = shape - step[:, 2:].reshape(-1, 2, 2) / half
-            if float(np.abs(step).max(initial=0.0)) < _CONVERGED_PX:
+            if float(np.abs(step).max(initial=0.0)) < _WINDOW.converged_px:
                 break
         return at, _correlation(values, light, weight)
 
@@ -147,8 +169,8 @@ class PrintAligner:
         """
         import cv2
 
-        finer = _FINER if sigma_px < _FINE_BELOW_PX else 1
-        apron = int(np.ceil(_APRON_SIGMAS * sigma_px))
+        finer = _PRINT.finer_samples if sigma_px < _PRINT.fine_below_px else 1
+        apron = int(np.ceil(_PRINT.apron_sigmas * sigma_px))
         reach = half + 1 + apron
         count = 2 * reach + 1
         fine = (np.arange(finer * count) - 0.5 * (finer * count - 1)) / finer
@@ -175,7 +197,7 @@ class PrintAligner:
         parts = [inner[:, i::finer, k::finer] for i in range(finer) for k in range(finer)]
         coarse = sum(parts[1:], start=parts[0]) / finer**2
         steps = np.arange(-half - 1, half + 2)
-        near = np.exp(-0.5 * np.square(steps / (_WINDOW_SHARE * half)))
+        near = np.exp(-0.5 * np.square(steps / (_WINDOW.weight_share * half)))
         weight = near[:, None] * near / near.sum() ** 2 * (coarse[..., 1] > 0.98)
         return np.asarray(coarse[..., 0], dtype=np.float64), weight
 
@@ -188,4 +210,4 @@ def _correlation(values: FloatArray, light: FloatArray, weight: FloatArray) -> F
     b = light - (light * weight).sum(axis=1, keepdims=True) / total
     length = np.sqrt((weight * a**2).sum(axis=1) * (weight * b**2).sum(axis=1))
     like = (weight * a * b).sum(axis=1) / np.maximum(length, 1e-9)
-    return np.where(known > _MIN_KNOWN, like, 0.0)
+    return np.where(known > _WINDOW.min_known_share, like, 0.0)

@@ -9,6 +9,7 @@ Statistical methods for tomographic image reconstruction (1987), for the weights
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,17 +25,41 @@ BoolArray = npt.NDArray[np.bool_]
 _INTRINSIC = 4  # fu fv cu cv, before a lens's coefficients
 _BOW = 2
 _POSE = 6
-_STEPS = 60
-_CONVERGED = 1e-6  # relative change of the cost
-_MAX_DAMPING = 1e8
-_WIDTH = 3.0  # standard deviations at which a corner's weight is a quarter
-_CUT = 4.5  # standard deviations beyond which a corner has no weight at the end
-_MIN_SIGMA_PX = 0.01
-# by which coefficients of a lens may be off zero: holds those that no view shows
-_COEFFICIENT_SIGMA = 10.0
-_BOW_SHARE = 0.01  # of the board's width: standard deviation of its bow before any view
-_MIN_USED = 4  # corners of a view
-_BEHIND_PX = 100.0  # residual of a corner that the lens cannot project
+
+
+class _Iterations(NamedTuple):
+    """When the adjustment ends."""
+
+    max_steps: int = 60
+    converged_share: float = 1e-6  # relative change of the cost
+    max_damping: float = 1e8
+
+
+_ITERATIONS = _Iterations()
+
+
+class _CornerWeights(NamedTuple):
+    """How much a corner counts."""
+
+    quarter_sigmas: float = 3.0  # standard deviations at which a corner's weight is a quarter
+    cut_sigmas: float = 4.5  # standard deviations beyond which a corner has no weight at the end
+    min_sigma_px: float = 0.01
+    min_used: int = 4  # corners of a view
+    behind_px: float = 100.0  # residual of a corner that the lens cannot project
+
+
+_WEIGHTS = _CornerWeights()
+
+
+class _Priors(NamedTuple):
+    """What is known before any view."""
+
+    # by which coefficients of a lens may be off zero: holds those that no view shows
+    coefficient_sigma: float = 10.0
+    bow_share: float = 0.01  # of the board's width: standard deviation of its bow before any view
+
+
+_PRIORS = _Priors()
 _MEDIAN_TO_SIGMA = 1.1774  # of the length of a vector of two Gaussian components
 
 
@@ -111,16 +136,16 @@ class BoardAdjustment:
         self._first = np.searchsorted(self.seen.view, np.arange(seen.views + 1))
         self._shape = bow_shape(seen.points_m)
         self._fixed = fixed_lenses  # and the pair and the bow: only the views' poses are found
-        self._bow_sigma_m = _BOW_SHARE * float(np.ptp(seen.points_m, axis=0).max())
+        self._bow_sigma_m = _PRIORS.bow_share * float(np.ptp(seen.points_m, axis=0).max())
 
-    def solve(self, start: RigFit, steps: int = _STEPS) -> Adjusted:
+    def solve(self, start: RigFit, steps: int = _ITERATIONS.max_steps) -> Adjusted:
         """Return the optimum from a start on."""
         at = self._descend(start, steps, cut=False)
         at = self._descend(at, steps, cut=True)
         r = self._residuals(at)
         used = self._weights(r, self._sigmas(r), cut=True) > 0
         # A view with fewer corners has no pose.
-        used &= np.bincount(self.seen.view, used)[self.seen.view] >= _MIN_USED
+        used &= np.bincount(self.seen.view, used)[self.seen.view] >= _WEIGHTS.min_used
         sigma = self._final_sigmas(r, used)
         weight = used / sigma[self.seen.camera] ** 2
         A, B, C, _, _ = self._normal(at, weight)
@@ -150,11 +175,11 @@ class BoardAdjustment:
                 if new is not None and after <= before:
                     break
                 damping *= 10
-                if damping > _MAX_DAMPING:
+                if damping > _ITERATIONS.max_damping:
                     return at
             at = new
             damping = max(damping / 10, 1e-9)
-            if before - after < _CONVERGED * before:
+            if before - after < _ITERATIONS.converged_share * before:
                 return at
         return at
 
@@ -173,42 +198,42 @@ class BoardAdjustment:
             rows = np.flatnonzero(self.seen.camera == c)
             T = at.T_cam_cam0[c]
             uv, valid = project_point(camera, p_cam0[rows] @ T[:3, :3].T + T[:3, 3])
-            out[rows] = np.where(valid[:, None], self.seen.uv[rows] - uv, _BEHIND_PX)
+            out[rows] = np.where(valid[:, None], self.seen.uv[rows] - uv, _WEIGHTS.behind_px)
         return out
 
     def _sigmas(self, r: FloatArray) -> FloatArray:
         """Robust standard deviation (C,) of a coordinate, of each camera."""
         length = np.linalg.norm(r, axis=1)
-        out = np.full(self.seen.cameras, _MIN_SIGMA_PX)
+        out = np.full(self.seen.cameras, _WEIGHTS.min_sigma_px)
         for c in range(self.seen.cameras):
             mine = length[self.seen.camera == c]
             if len(mine):
-                out[c] = max(median(mine) / _MEDIAN_TO_SIGMA, _MIN_SIGMA_PX)
+                out[c] = max(median(mine) / _MEDIAN_TO_SIGMA, _WEIGHTS.min_sigma_px)
         return out
 
     def _final_sigmas(self, r: FloatArray, used: BoolArray) -> FloatArray:
         """Root mean square (C,) of the residuals that are used, freed of the fit's own unknowns."""
-        out = np.full(self.seen.cameras, _MIN_SIGMA_PX)
+        out = np.full(self.seen.cameras, _WEIGHTS.min_sigma_px)
         for c in range(self.seen.cameras):
             rows = used & (self.seen.camera == c)
             unknowns = _POSE * len(np.unique(self.seen.view[rows])) / self.seen.cameras
             freedom = max(2 * int(rows.sum()) - unknowns - 10, 1)
-            out[c] = max(float(np.sqrt(np.sum(r[rows] ** 2) / freedom)), _MIN_SIGMA_PX)
+            out[c] = max(float(np.sqrt(np.sum(r[rows] ** 2) / freedom)), _WEIGHTS.min_sigma_px)
         return out
 
     def _weights(self, r: FloatArray, sigma: FloatArray, *, cut: bool) -> FloatArray:
         """Weights (R,) of squared residuals: Geman and McClure's, or all or nothing."""
         squared = np.sum(r**2, axis=1) / sigma[self.seen.camera] ** 2
         if cut:
-            robust = (squared < _CUT**2).astype(np.float64)
+            robust = (squared < _WEIGHTS.cut_sigmas**2).astype(np.float64)
         else:
-            robust = 1 / (1 + squared / _WIDTH**2) ** 2
+            robust = 1 / (1 + squared / _WEIGHTS.quarter_sigmas**2) ** 2
         return np.asarray(robust / sigma[self.seen.camera] ** 2)
 
     def _cost(self, r: FloatArray, weight: FloatArray, at: RigFit) -> float:
         prior = 0.0
         for camera in at.cameras:
-            prior += float(np.sum(np.square(camera.coefficients))) / _COEFFICIENT_SIGMA**2
+            prior += float(np.sum(np.square(camera.coefficients))) / _PRIORS.coefficient_sigma**2
         prior += float(np.sum(at.bow**2)) / self._bow_sigma_m**2
         return float(weight @ np.sum(r**2, axis=1)) + prior
 
@@ -261,8 +286,8 @@ class BoardAdjustment:
         """Add what is known before any view to the shared equations."""
         for camera, lens in zip(at.cameras, layout.lenses, strict=True):
             rows = np.arange(lens.start + _INTRINSIC, lens.stop)
-            C[rows, rows] += 1 / _COEFFICIENT_SIGMA**2
-            g[rows] -= np.array(camera.coefficients) / _COEFFICIENT_SIGMA**2
+            C[rows, rows] += 1 / _PRIORS.coefficient_sigma**2
+            g[rows] -= np.array(camera.coefficients) / _PRIORS.coefficient_sigma**2
         rows = np.arange(layout.bow.start, layout.bow.stop)
         C[rows, rows] += 1 / self._bow_sigma_m**2
         g[rows] -= at.bow / self._bow_sigma_m**2

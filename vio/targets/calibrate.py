@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,12 +25,19 @@ from vio.targets.start import one_camera, pair_start, pose_only
 from vio.targets.verdict import MIN_VIEWS, Verdict, corners_by_part, judge, part_name
 from vio.targets.views import Sightings, sightings
 
-_MIN_CORNERS = 12  # of a view that is used
-_MAX_VIEWS = 60
-_DOUBT_SIGMAS = 2.0  # stated, beyond which another lens model's difference is named
-_MIN_DOUBT_PX = 0.1
-_MAX_REFUSED = 0.3  # of a pair's corners, beyond which it is none
-_MAX_RESIDUAL_PX = 3.0  # beyond which the board or the lens is another one
+
+class _ViewRules(NamedTuple):
+    """Which views are used, and what of them is doubted."""
+
+    min_corners: int = 12  # of a view that is used
+    max_views: int = 60
+    doubt_sigmas: float = 2.0  # stated, beyond which another lens model's difference is named
+    min_doubt_px: float = 0.1
+    max_refused_share: float = 0.3  # of a pair's corners, beyond which it is none
+    max_residual_px: float = 3.0  # beyond which the board or the lens is another one
+
+
+_VIEWS = _ViewRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +112,7 @@ def lens_finding(lens: str, rivals: tuple[Rival, ...], verdict: Verdict) -> str 
     stated = verdict.inflation * verdict.projection_sigma_px[0]
     beyond: list[tuple[float, str, str]] = []
     for rival in rivals:
-        limit = np.maximum(_DOUBT_SIGMAS * stated, _MIN_DOUBT_PX)
+        limit = np.maximum(_VIEWS.doubt_sigmas * stated, _VIEWS.min_doubt_px)
         off = np.where(rival.off_px > limit, rival.off_px, 0.0)
         worst = int(np.argmax(off))
         if off[worst] > 0:
@@ -142,12 +150,12 @@ def calibrate_with_imu(
         raise DataError("the recording has no IMU; record its samples with the images")
     seen = sightings(filmed.views, target.points_m)
     left = np.bincount(seen.view[seen.camera == 0], minlength=seen.views)
-    chosen = np.flatnonzero(left >= _MIN_CORNERS)
+    chosen = np.flatnonzero(left >= _VIEWS.min_corners)
     seen = seen.of_views(chosen)
     problem, found = pose_only(cameras.found.at, seen)
     # A view that fits badly has a wrong pose.
     used = np.bincount(seen.view[found.used & (seen.camera == 0)], minlength=seen.views)
-    good = np.flatnonzero(used >= _MIN_CORNERS)
+    good = np.flatnonzero(used >= _VIEWS.min_corners)
     times_ns = np.array([filmed.views[v].time_ns for v in chosen[good].tolist()], dtype=np.int64)
     information = problem.pose_information(found) / cameras.verdict.inflation**2
     poses = BoardPoses(times_ns, found.at.T_cam0_board[good], information[good])
@@ -160,11 +168,11 @@ def chosen_views(seen: Sightings) -> Sightings:
     """
     image = seen.view * seen.cameras + seen.camera
     counts = np.bincount(image, minlength=seen.views * seen.cameras)
-    kept = seen.take(np.flatnonzero(counts[image] >= _MIN_CORNERS))
+    kept = seen.take(np.flatnonzero(counts[image] >= _VIEWS.min_corners))
     views: IntArray = np.unique(kept.view)
-    if len(views) > _MAX_VIEWS:
+    if len(views) > _VIEWS.max_views:
         total = np.bincount(kept.view, minlength=seen.views)
-        parts = np.array_split(views, _MAX_VIEWS)
+        parts = np.array_split(views, _VIEWS.max_views)
         views = np.array([part[np.argmax(total[part])] for part in parts], dtype=np.int64)
     return kept.of_views(views)
 
@@ -187,7 +195,7 @@ def _explained(filmed: Filmed, camera: int, target: Target) -> Iterator[None]:
 def _check_views(filmed: Filmed, target: Target) -> None:
     names = ("left", "right") if len(filmed.sizes) > 1 else ("only",)
     for c, name in enumerate(names):
-        count = sum(len(view.corners[c]) >= _MIN_CORNERS for view in filmed.views)
+        count = sum(len(view.corners[c]) >= _VIEWS.min_corners for view in filmed.views)
         if count < MIN_VIEWS:
             if (reason := _diagnosis(filmed, c, target)) is not None:
                 raise DataError(f"{name} camera: {reason}")
@@ -196,7 +204,7 @@ def _check_views(filmed: Filmed, target: Target) -> None:
                 f"{MIN_VIEWS} are needed; check that the target file is that of the board, move it "
                 "closer, light it well, and record 30 s of it at several distances and tilts"
             )
-    together = sum(min(map(len, view.corners)) >= _MIN_CORNERS for view in filmed.views)
+    together = sum(min(map(len, view.corners)) >= _VIEWS.min_corners for view in filmed.views)
     if together < MIN_VIEWS // 2:
         raise DataError(
             f"the cameras see the board together in {together} frames, and {MIN_VIEWS // 2} are "
@@ -206,7 +214,7 @@ def _check_views(filmed: Filmed, target: Target) -> None:
 
 def _check_fit(one: Adjusted, camera: int, filmed: Filmed, target: Target) -> None:
     residual = median(np.linalg.norm(one.residuals_px, axis=1))
-    if residual > _MAX_RESIDUAL_PX:
+    if residual > _VIEWS.max_residual_px:
         reason = _diagnosis(filmed, camera, target)
         advice = reason or "check rows, columns, tag spacing and numbering in the target file"
         raise CalibrationError(
@@ -219,7 +227,7 @@ def _check_pair(found: Adjusted) -> None:
     """Refuse images that are no pair, or exchanged."""
     refused = float(np.mean(~found.used))
     off_px = float(found.sigma_px.max())
-    if refused > _MAX_REFUSED or off_px > _MAX_RESIDUAL_PX:
+    if refused > _VIEWS.max_refused_share or off_px > _VIEWS.max_residual_px:
         raise DataError(
             "left and right images are not of the same moments: corners fit each camera alone, and "
             f"with one pose of the right camera they are off by {off_px:.0f} px, "

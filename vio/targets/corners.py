@@ -13,6 +13,7 @@ localization of checkerboard corners for calibration (2018), for `findChessboard
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,22 +27,47 @@ from vio.targets.seeds import MarkerReader, checkerboard_seeds
 
 BoolArray = npt.NDArray[np.bool_]
 
-_MIN_TAG_PX = 12.0  # side of a tag below which its corners cannot be told apart
-_MIN_NEIGHBOURS = 4
-_REACH = 1.45  # pitches from a known corner within which others are predicted
-_ROUNDS = 16  # of growth over the grid
-_TRIES = 5  # to find a corner, as its neighbours become known
-_MIN_WINDOW_PX = 2  # half the side of the window of a refinement
-_MAX_WINDOW_PX = 9
-_MAX_SHARP_PX = 1.5  # blur beyond which the print is aligned in place of its saddle points
-_MIN_PRINT_LIKENESS = 0.8  # correlation of the image with the print, blurred as much
-_MARGIN_PX = 3.0  # corners nearer to the border are not used: their window is cut
-_MIN_LIKENESS = 0.5  # normalised correlation with the board, of a tag or the squares at a corner
-_SAMPLES = 16  # along a side of what is correlated
-_MIN_CONTRAST = 12.0  # standard deviation of the gray values there
-_OUTLIER_SIGMAS = 6.0  # of a corner against the homography of its neighbours
-_MIN_OUTLIER_PX = 0.3
-_MIN_CORNERS = 8  # of a view
+
+class _GrowthRules(NamedTuple):
+    """How corners are found from their neighbours."""
+
+    min_tag_px: float = 12.0  # side of a tag below which its corners cannot be told apart
+    min_neighbours: int = 4
+    reach_pitches: float = 1.45  # pitches from a known corner within which others are predicted
+    rounds: int = 16  # of growth over the grid
+    tries: int = 5  # to find a corner, as its neighbours become known
+    min_corners: int = 8  # of a view
+
+
+_GROWTH = _GrowthRules()
+
+
+class _RefinementRules(NamedTuple):
+    """How a corner is refined."""
+
+    min_window_px: int = 2  # half the side of the window of a refinement
+    max_window_px: int = 9
+    # blur beyond which the print is aligned in place of its saddle points
+    max_sharp_px: float = 1.5
+    min_print_likeness: float = 0.8  # correlation of the image with the print, blurred as much
+    margin_px: float = 3.0  # corners nearer to the border are not used: their window is cut
+
+
+_REFINEMENT = _RefinementRules()
+
+
+class _CheckRules(NamedTuple):
+    """Which corners are believed."""
+
+    # normalised correlation with the board, of a tag or the squares at a corner
+    min_likeness: float = 0.5
+    samples: int = 16  # along a side of what is correlated
+    min_contrast: float = 12.0  # standard deviation of the gray values there
+    outlier_sigmas: float = 6.0  # of a corner against the homography of its neighbours
+    min_outlier_px: float = 0.3
+
+
+_CHECK = _CheckRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +100,12 @@ class CornerDetector:
     def detect(self, image: Image) -> Corners:
         """Return the corners of the board; none where it is not seen."""
         board, uv = self._seeds(image)
-        if len(uv) < _MIN_NEIGHBOURS:
+        if len(uv) < _GROWTH.min_neighbours:
             return NO_CORNERS
         found = self._grown(image, board, uv, self._blur_px(image, board, uv))
         ids = np.flatnonzero(np.isfinite(found[:, 0]))
         ids = ids[self._agree(ids, found[ids])]
-        return Corners(ids, found[ids]) if len(ids) >= _MIN_CORNERS else NO_CORNERS
+        return Corners(ids, found[ids]) if len(ids) >= _GROWTH.min_corners else NO_CORNERS
 
     def _seeds(self, image: Image) -> tuple[FloatArray, FloatArray]:
         """Places on the board (S, 2) and pixels (S, 2) of what is found without prediction."""
@@ -116,8 +142,8 @@ class CornerDetector:
         """Pixels (N, 2) of the board's corners; NaN: not found."""
         found = np.full((len(self.points_m), 2), np.nan)
         tried = np.zeros(len(self.points_m), dtype=np.int64)
-        for turn in range(_ROUNDS):
-            missing = np.flatnonzero(np.isnan(found[:, 0]) & (tried < _TRIES))
+        for turn in range(_GROWTH.rounds):
+            missing = np.flatnonzero(np.isnan(found[:, 0]) & (tried < _GROWTH.tries))
             near = self._within_reach(missing, board)
             if not len(near):
                 break
@@ -126,12 +152,12 @@ class CornerDetector:
             tried[near] += 1
             found[near[good]] = refined[good]
             have = np.isfinite(found[:, 0])
-            if have.sum() >= _MIN_NEIGHBOURS:
+            if have.sum() >= _GROWTH.min_neighbours:
                 board = self.points_m[have]
                 uv = found[have]
             if turn and not good.any():
                 break
-        if blur_px > _MAX_SHARP_PX and len(board) > _MIN_NEIGHBOURS:
+        if blur_px > _REFINEMENT.max_sharp_px and len(board) > _GROWTH.min_neighbours:
             # Again, as neighbours on all sides show the print.
             have = np.flatnonzero(np.isfinite(found[:, 0]))
             predicted, H = predict(self.points_m[have], board, uv)
@@ -143,7 +169,7 @@ class CornerDetector:
         if not len(missing):
             return missing
         apart = np.linalg.norm(self.points_m[missing, None] - board, axis=2).min(axis=1)
-        return missing[apart < _REACH * self.target.pitch_m]
+        return missing[apart < _GROWTH.reach_pitches * self.target.pitch_m]
 
     def _refined(
         self, image: Image, ids: IntArray, uv: FloatArray, H: FloatArray, blur_px: float
@@ -155,11 +181,15 @@ class CornerDetector:
         uv_D_board = derivative(H, self.points_m[ids], uv)
         scale_px = np.linalg.svd(uv_D_board, compute_uv=False)[:, 1]  # pixels per metre, least
         tag_px = scale_px * self.target.size_m
-        limit = (uv > _MARGIN_PX) & (uv < np.array([width, height]) - 1 - _MARGIN_PX)
-        good = limit.all(axis=1) & (tag_px > _MIN_TAG_PX) & (np.linalg.det(uv_D_board) > 0)
-        if blur_px > _MAX_SHARP_PX:
+        limit = (uv > _REFINEMENT.margin_px) & (
+            uv < np.array([width, height]) - 1 - _REFINEMENT.margin_px
+        )
+        good = limit.all(axis=1) & (tag_px > _GROWTH.min_tag_px) & (np.linalg.det(uv_D_board) > 0)
+        if blur_px > _REFINEMENT.max_sharp_px:
             return self._aligned(image, ids, uv, H, blur_px, good)
-        window = np.clip(self._free_m() * scale_px * 0.7, _MIN_WINDOW_PX, _MAX_WINDOW_PX)
+        window = np.clip(
+            self._free_m() * scale_px * 0.7, _REFINEMENT.min_window_px, _REFINEMENT.max_window_px
+        )
         out = uv.copy()
         windows = window.astype(int)
         for size in np.unique(windows[good]).tolist():
@@ -167,12 +197,14 @@ class CornerDetector:
             out[rows] = subpixel(image, uv[rows], size)
         moved = np.linalg.norm(out - uv, axis=1)
         good &= moved < np.maximum(1.0, 0.8 * window)
-        inside = (out > _MARGIN_PX) & (out < np.array([width, height]) - 1 - _MARGIN_PX)
+        inside = (out > _REFINEMENT.margin_px) & (
+            out < np.array([width, height]) - 1 - _REFINEMENT.margin_px
+        )
         good &= inside.all(axis=1)
         like = self._templates.likeness(image, ids, out - uv, H)
         if self._looks_the_same_turned:
             like = np.abs(like)  # its first square may be light
-        good &= like > _MIN_LIKENESS
+        good &= like > _CHECK.min_likeness
         return out, good
 
     def _aligned(
@@ -192,7 +224,7 @@ class CornerDetector:
             out[rows], like = self._aligner.aligned(image, ids[rows], uv[rows], H[rows], blur_px)
             if self._looks_the_same_turned:
                 like = np.abs(like)
-            good[rows] = like > _MIN_PRINT_LIKENESS
+            good[rows] = like > _REFINEMENT.min_print_likeness
         return out, good
 
     def _free_m(self) -> float:
@@ -206,16 +238,18 @@ class CornerDetector:
 
     def _agree(self, ids: IntArray, uv: FloatArray) -> BoolArray:
         """Return which corners (K,) agree with the homography of their neighbours."""
-        if len(ids) < _MIN_CORNERS:
+        if len(ids) < _GROWTH.min_corners:
             return np.zeros(len(ids), dtype=bool)
         keep = np.ones(len(ids), dtype=bool)
         for _ in range(2):
             board = self.points_m[ids[keep]]
             predicted, _ = predict(self.points_m[ids], board, uv[keep], leave_out=True)
             off = np.linalg.norm(predicted - uv, axis=1)
-            limit = max(_OUTLIER_SIGMAS * float(np.median(off[keep])) / 1.18, _MIN_OUTLIER_PX)
+            limit = max(
+                _CHECK.outlier_sigmas * float(np.median(off[keep])) / 1.18, _CHECK.min_outlier_px
+            )
             keep = off < limit
-            if keep.sum() < _MIN_CORNERS:
+            if keep.sum() < _GROWTH.min_corners:
                 return np.zeros(len(ids), dtype=bool)
         return keep
 
@@ -258,13 +292,13 @@ class _Templates:
 
     def __init__(self, target: Target, markers: dict[int, Marker]) -> None:
         self._points = target.points_m
-        steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        steps = (np.arange(_CHECK.samples) + 0.5) / _CHECK.samples
         grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         count = len(self._points)
         if target.kind == "aprilgrid":
             # The whole tag, whose code tells it from its neighbours.
-            self._offset = np.empty((count, _SAMPLES**2, 2))
-            self._light = np.empty((count, _SAMPLES**2))
+            self._offset = np.empty((count, _CHECK.samples**2, 2))
+            self._light = np.empty((count, _CHECK.samples**2))
             for n, marker in enumerate(markers.values()):
                 side = marker.corners_m[2] - marker.corners_m[0]
                 at = marker.corners_m[0] + grid * side
@@ -279,7 +313,7 @@ class _Templates:
             reach = 0.5 * target.size_m * (1 - target.ratio)
         offset = (grid - 0.5) * 2 * reach
         self._offset = np.tile(offset, (count, 1, 1))
-        self._light = np.empty((count, _SAMPLES**2))
+        self._light = np.empty((count, _CHECK.samples**2))
         for n, point in enumerate(self._points):
             cells = np.floor((point + offset) / target.size_m).astype(int)
             self._light[n] = [not target.square_is_dark(row, col) for col, row in cells.tolist()]
@@ -304,4 +338,4 @@ class _Templates:
         contrast = np.linalg.norm(a, axis=1) / np.sqrt(total[:, 0])
         like = (a * b).sum(axis=1) / np.maximum(length, 1e-9)
         enough = weight.mean(axis=1) > 0.3
-        return np.where(enough & (contrast > _MIN_CONTRAST), like, 0.0)
+        return np.where(enough & (contrast > _CHECK.min_contrast), like, 0.0)

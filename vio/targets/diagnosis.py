@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,15 +16,24 @@ from vio.targets.description import APRILTAG, Target, marker_dictionary
 from vio.targets.homography import homographies, mapped
 from vio.targets.seeds import MarkerReader, Read
 
-_MIN_MARKERS = 4  # of one image that show which board it is
-_MAX_COLS = 14
+
+class _MarkerRules(NamedTuple):
+    """How another board is recognised by its markers."""
+
+    min_markers: int = 4  # of one image that show which board it is
+    max_cols: int = 14
+    # misfit over that of the file's board, below which another one is named
+    better_ratio: float = 0.4
+    max_misfit_share: float = 0.15  # of a marker's side, of the board that is named
+    # of a marker's side: half the window in which its corners are refined
+    window_share: float = 0.12
+    compared_markers: int = 9  # markers by which boards are compared
+    tried_markers: int = 100  # numbers that are read
+
+
+_MARKERS = _MarkerRules()
 _SPACINGS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 _MARKER_SHARES = (0.5, 0.6, 0.7, 0.75, 0.8)
-_MUCH_BETTER = 0.4  # misfit over that of the file's board, below which another one is named
-_MAX_MISFIT = 0.15  # of a marker's side, of the board that is named
-_WINDOW_SHARE = 0.12  # of a marker's side: half the window in which its corners are refined
-_COMPARED = 9  # markers by which boards are compared
-_MARKERS_TRIED = 100  # numbers that are read
 # Dictionaries of which all smaller ones of a size are the beginning.
 _DICTIONARIES = (
     "DICT_4X4_1000",
@@ -60,11 +70,11 @@ def diagnose(images: Sequence[Image], target: Target) -> str | None:
 def _other_arrangement(images: Sequence[Image], target: Target) -> str | None:
     """Say in which rows and at which distances the markers stand, where not as described."""
     read = _close_together(_most_read(images, _with_more_markers(target)))
-    if len(read) < _MIN_MARKERS:
+    if len(read) < _MARKERS.min_markers:
         return None
     best = min(_arrangements(target), key=lambda other: _misfit(read, other))
     misfit = _misfit(read, best)
-    if misfit > _MAX_MISFIT or misfit > _MUCH_BETTER * _misfit(read, target):
+    if misfit > _MARKERS.max_misfit_share or misfit > _MARKERS.better_ratio * _misfit(read, target):
         return None
     if best.cols != target.cols:
         one = "tags" if target.kind == "aprilgrid" else "squares"
@@ -88,10 +98,12 @@ def _other_arrangement(images: Sequence[Image], target: Target) -> str | None:
 def _with_more_markers(target: Target) -> Target:
     """Return a board with as many markers as are tried."""
     known = len(marker_dictionary(target.dictionary).bytesList) - target.first_id
-    count = max(min(_MARKERS_TRIED, known), 1)
+    count = max(min(_MARKERS.tried_markers, known), 1)
     if target.kind == "aprilgrid":
         return replace(target, rows=1, cols=count)
-    return replace(target, rows=max(2 * count // _MAX_COLS, 3), cols=_MAX_COLS, legacy=False)
+    return replace(
+        target, rows=max(2 * count // _MARKERS.max_cols, 3), cols=_MARKERS.max_cols, legacy=False
+    )
 
 
 def _most_read(images: Sequence[Image], target: Target) -> list[Read]:
@@ -102,7 +114,7 @@ def _most_read(images: Sequence[Image], target: Target) -> list[Read]:
 
 def _refined(image: Image, read: Sequence[Read]) -> list[Read]:
     """Return markers whose corners are where the image has theirs."""
-    half_px = [max(_WINDOW_SHARE * one.side_px, 2.0) for one in read]
+    half_px = [max(_MARKERS.window_share * one.side_px, 2.0) for one in read]
     return [
         replace(one, uv=subpixel(image, one.uv, int(half)))
         for one, half in zip(read, half_px, strict=True)
@@ -115,7 +127,7 @@ def _close_together(read: Sequence[Read]) -> list[Read]:
         return []
     centre = np.stack([one.uv.mean(axis=0) for one in read])
     middle = centre[np.argmin(np.linalg.norm(centre - centre.mean(axis=0), axis=1))]
-    near = np.argsort(np.linalg.norm(centre - middle, axis=1))[:_COMPARED]
+    near = np.argsort(np.linalg.norm(centre - middle, axis=1))[: _MARKERS.compared_markers]
     return [read[k] for k in near.tolist()]
 
 
@@ -123,7 +135,7 @@ def _arrangements(target: Target) -> Iterator[Target]:
     """Yield boards of the same markers in other rows and at other distances."""
     is_grid = target.kind == "aprilgrid"
     ratios = _SPACINGS if is_grid else _MARKER_SHARES
-    for cols in range(2 if is_grid else 3, _MAX_COLS + 1):
+    for cols in range(2 if is_grid else 3, _MARKERS.max_cols + 1):
         for ratio in (target.ratio, *ratios):
             yield replace(target, cols=cols, ratio=ratio)
             if not is_grid:
@@ -189,8 +201,8 @@ def _checkerboard_in(images: Sequence[Image], target: Target) -> str | None:
 
 def _tags_in(images: Sequence[Image], target: Target) -> str | None:
     """Return tags of an AprilGrid in the images that are not those of the target."""
-    read = _most_read(images, Target("aprilgrid", 1, _MARKERS_TRIED, 0.1, 0.3))
-    if len(read) < _MIN_MARKERS:
+    read = _most_read(images, Target("aprilgrid", 1, _MARKERS.tried_markers, 0.1, 0.3))
+    if len(read) < _MARKERS.min_markers:
         return None
     numbers = [one.id for one in read]
     if target.kind == "aprilgrid" and _are_own(numbers, target):
@@ -208,7 +220,7 @@ def _markers_in(images: Sequence[Image], target: Target) -> str | None:
     """Return markers of some dictionary in the images that are not those of the target."""
     import cv2
 
-    most = _MIN_MARKERS - 1
+    most = _MARKERS.min_markers - 1
     found: str | None = None
     for name in _DICTIONARIES:
         detector = cv2.aruco.ArucoDetector(marker_dictionary(name), cv2.aruco.DetectorParameters())

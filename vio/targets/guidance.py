@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,13 +21,29 @@ from vio.targets.homography import derivative, homographies, mapped
 from vio.targets.verdict import CELLS, MIN_TILT_DEG, corners_by_part, part_name
 
 ENOUGH_VIEWS = 30
-_MIN_CORNERS = 12
-_MIN_CELL_CORNERS = 12  # in a part of an image
-_MIN_TILTED = 3  # views, in each direction
-_MIN_SCALE_RATIO = 1.6  # of the nearest view over the farthest
-_MIN_MOVED_SHARE = 0.04  # of the image's width, from each earlier view
-_MIN_TURN_RPS = 0.4  # standard deviation of each of the gyro's axes
-_MIN_IMU_S = 30.0
+
+
+class _ViewRules(NamedTuple):
+    """What the views of a board must show."""
+
+    min_corners: int = 12
+    min_cell_corners: int = 12  # in a part of an image
+    min_tilted_views: int = 3  # views, in each direction
+    min_scale_ratio: float = 1.6  # of the nearest view over the farthest
+    min_moved_share: float = 0.04  # of the image's width, from each earlier view
+
+
+_VIEWS = _ViewRules()
+
+
+class _ImuRules(NamedTuple):
+    """What the IMU must feel."""
+
+    min_turn_radps: float = 0.4  # standard deviation of each of the gyro's axes
+    min_s: float = 30.0
+
+
+_IMU = _ImuRules()
 _GYRO_NS = NS_PER_S // 20  # between samples that are kept
 _SIDES = ("right", "lower", "left", "upper")  # of the board as it appears, that recede
 
@@ -71,7 +88,7 @@ class Guidance:
             self._sizes = [(image.shape[1], image.shape[0]) for image in images]
             self._cells = [np.zeros(CELLS**2) for _ in images]
         found = tuple(self._detector.detect(image) for image in images)
-        if max(map(len, found)) < _MIN_CORNERS or not self._is_new(found):
+        if max(map(len, found)) < _VIEWS.min_corners or not self._is_new(found):
             return False
         self._views.append(found)
         for cells, corners, size in zip(self._cells, found, self._sizes, strict=True):
@@ -84,7 +101,7 @@ class Guidance:
 
     def lacks(self) -> Lacks:
         """Return what is missing now."""
-        together = sum(min(map(len, view)) >= _MIN_CORNERS for view in self._views)
+        together = sum(min(map(len, view)) >= _VIEWS.min_corners for view in self._views)
         count = len(self._views)
         wanted: list[str] = []
         if not count:
@@ -103,10 +120,10 @@ class Guidance:
             moved: list[float] = []
             for new, old, (width, _) in zip(found, view, self._sizes, strict=True):
                 _, mine, its = np.intersect1d(new.ids, old.ids, return_indices=True)
-                if len(mine) >= _MIN_CORNERS // 2:
+                if len(mine) >= _VIEWS.min_corners // 2:
                     apart = np.linalg.norm(new.uv[mine] - old.uv[its], axis=1)
                     moved.append(median(apart) / width)
-            if moved and max(moved) < _MIN_MOVED_SHARE:
+            if moved and max(moved) < _VIEWS.min_moved_share:
                 return False
         return True
 
@@ -134,7 +151,7 @@ class Guidance:
         out: list[str] = []
         names = ("left image", "right image") if len(self._sizes) > 1 else ("image",)
         for name, cells in zip(names, self._cells, strict=True):
-            empty = [part_name(k) for k in np.flatnonzero(cells < _MIN_CELL_CORNERS).tolist()]
+            empty = [part_name(k) for k in np.flatnonzero(cells < _VIEWS.min_cell_corners).tolist()]
             if empty:
                 out.append(f"the {name} is empty at {', '.join(empty)}")
         return out
@@ -142,7 +159,7 @@ class Guidance:
     def _missing_tilts(self) -> list[str]:
         tilts = np.array(self._tilts_deg)
         tilted = np.concatenate([tilts, -tilts], axis=1)
-        few = np.sum(tilted > MIN_TILT_DEG, axis=0) < _MIN_TILTED
+        few = np.sum(tilted > MIN_TILT_DEG, axis=0) < _VIEWS.min_tilted_views
         missing = [side for side, lacks in zip(_SIDES, few.tolist(), strict=True) if lacks]
         return (
             [f"tilt the board, its {' and then its '.join(missing)} side away"] if missing else []
@@ -150,7 +167,7 @@ class Guidance:
 
     def _missing_distances(self) -> list[str]:
         scales = np.array(self._scales)
-        if scales.max() > _MIN_SCALE_RATIO * scales.min():
+        if scales.max() > _VIEWS.min_scale_ratio * scales.min():
             return []
         return ["show it from nearer and from farther away"]
 
@@ -161,10 +178,12 @@ class Guidance:
         seconds = (self._gyro_ns[-1] - self._gyro_ns[0]) / NS_PER_S
         turning = np.array(self._gyro).std(axis=0)
         slow = [
-            axis for axis, rate in zip("xyz", turning.tolist(), strict=True) if rate < _MIN_TURN_RPS
+            axis
+            for axis, rate in zip("xyz", turning.tolist(), strict=True)
+            if rate < _IMU.min_turn_radps
         ]
         if slow:
             out.append(f"turn the rig to and fro about the IMU's {', '.join(slow)}")
-        if seconds < _MIN_IMU_S:
-            out.append(f"record {_MIN_IMU_S - seconds:.0f} s more for the IMU")
+        if seconds < _IMU.min_s:
+            out.append(f"record {_IMU.min_s - seconds:.0f} s more for the IMU")
         return out

@@ -7,6 +7,7 @@ of the best linear map between both rates, as none is given.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,9 +24,16 @@ from vio.monitor.samples import Size, judge_size
 from vio.numerics.robust import median
 from vio.records import S_PER_NS, ImuRecord, IntArray
 
-_MAX_STEP_S = 0.5  # between views whose poses give a rate
-_MIN_INTERVALS = 20
-_MIN_OFFSET_S = 0.05  # below, the adjustment finds the clock's offset by itself
+
+class _OffsetRules(NamedTuple):
+    """When the clock's offset is found first."""
+
+    max_step_s: float = 0.5  # between views whose poses give a rate
+    min_intervals: int = 20
+    min_offset_s: float = 0.05  # below, the adjustment finds the clock's offset by itself
+
+
+_OFFSET = _OffsetRules()
 
 _MIRRORED = InertialFinding(
     "gyro axes",
@@ -56,11 +64,11 @@ def check_imu(
     intervals = _intervals(times_ns, T_cam0_board)
     record = None
     gyro_fit = None
-    if len(intervals) >= _MIN_INTERVALS:
+    if len(intervals) >= _OFFSET.min_intervals:
         values = np.concatenate([imu.gyro, imu.accel], axis=1)
         record = record_of(intervals, imu.times_ns, values)
         step_s = median(record.end - record.begin)
-        gyro_fit = fit_gyro(record, _MIN_INTERVALS, np.sqrt(2) * rotation_sigma_rad / step_s)
+        gyro_fit = fit_gyro(record, _OFFSET.min_intervals, np.sqrt(2) * rotation_sigma_rad / step_s)
     if record is None or gyro_fit is None:
         # The adjustment says which rotation is missing.
         found = [] if size.finding is None else [size.finding]
@@ -71,7 +79,7 @@ def check_imu(
             raise _error(finding)
     if gyro_fit is None:
         return 0.0
-    return gyro_fit.offset_s if abs(gyro_fit.offset_s) > _MIN_OFFSET_S else 0.0
+    return gyro_fit.offset_s if abs(gyro_fit.offset_s) > _OFFSET.min_offset_s else 0.0
 
 
 def _error(finding: InertialFinding) -> DataError:
@@ -81,7 +89,7 @@ def _error(finding: InertialFinding) -> DataError:
 def _intervals(times_ns: IntArray, T_cam0_board: FloatArray) -> Intervals:
     """Return the camera's motion between views that follow each other soon."""
     seconds = np.diff(times_ns) * S_PER_NS
-    rows = np.flatnonzero((seconds > 0) & (seconds < _MAX_STEP_S))
+    rows = np.flatnonzero((seconds > 0) & (seconds < _OFFSET.max_step_s))
     moved = T_cam0_board[rows] @ se3_inverse(T_cam0_board[rows + 1])
     twists = se3_log(moved) / seconds[rows, None]
     return Intervals(times_ns[rows], times_ns[rows + 1], twists)

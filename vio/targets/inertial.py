@@ -10,6 +10,7 @@ systems (2013), for the problem; `vio.imu.preintegration` for the IMU's terms.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,22 +32,55 @@ from vio.targets.imu_checks import check_imu
 
 _STATE = 15  # of a view: xi of its pose, velocity, biases
 _SHARED = 9  # xi of `T_cam0_imu exp(xi)`, time, two turns of gravity; then the IMU's terms
-_STEPS = 20
-_CONVERGED = 1e-5  # relative change of the cost
-_MIN_VIEWS = 20
-_MAX_STEP_S = 1.0  # between views from which rates are taken for the start
+
+
+class _Iterations(NamedTuple):
+    """Steps of the adjustment."""
+
+    max_steps: int = 20
+    converged_share: float = 1e-5  # relative change of the cost
+    numeric_step: float = 1e-6
+    term_step: float = 1e-4
+    gauge_weight: float = 1e-9
+    max_damping: float = 1e6
+
+
+_ITERATIONS = _Iterations()
+
+
+class _ViewRules(NamedTuple):
+    """How much a view counts."""
+
+    min_views: int = 20
+    max_step_s: float = 1.0  # between views from which rates are taken for the start
+    # chi-square over its degrees of freedom at which a view's weight is a quarter
+    quarter_chi: float = 9.0
+    min_mean_chi: float = 1.0
+
+
+_VIEWS = _ViewRules()
 _BIAS_SIGMA = np.repeat([0.1, 0.5], 3)  # at the first view, rad/s and m/s^2
-_WIDTH = 9.0  # chi-square over its degrees of freedom at which a view's weight is a quarter
-_MIN_MEAN_CHI = 1.0
-_WEAK_ROTATION_DEG = 0.2  # standard deviations beyond which a quantity is called weak
-_WEAK_M = 0.005
-_WEAK_S = 1e-3
-_NUMERIC_STEP = 1e-6
-_TERM_STEP = 1e-4
-_SIZE_SIGMAS = 4.0  # by which the board's size must be off to be named
-_MIN_SIZE_SHARE = 0.02  # and by how much: accelerometers are off by 1 %
-_GAUGE = 1e-9
-_MAX_DAMPING = 1e6
+
+
+class _WeakRules(NamedTuple):
+    """Standard deviations beyond which a quantity is called weak."""
+
+    rotation_deg: float = 0.2  # standard deviations beyond which a quantity is called weak
+    translation_m: float = 0.005
+    time_s: float = 1e-3
+
+
+_WEAK = _WeakRules()
+
+
+class _SizeRules(NamedTuple):
+    """When the board's size is off."""
+
+    min_sigmas: float = 4.0  # by which the board's size must be off to be named
+    min_share: float = 0.02  # and by how much: accelerometers are off by 1 %
+
+
+_SIZE = _SizeRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,10 +176,10 @@ class _Problem:
         self._r_D_terms: FloatArray | None = None
         self._origin = int(imu.times_ns[0])
         inside = (poses.times_ns > imu.times_ns[0]) & (poses.times_ns < imu.times_ns[-1])
-        if inside.sum() < _MIN_VIEWS:
+        if inside.sum() < _VIEWS.min_views:
             raise DataError(
                 f"{int(inside.sum())} views of the board lie within the IMU's record, and "
-                f"{_MIN_VIEWS} are needed: check that both clocks are one and in nanoseconds, and "
+                f"{_VIEWS.min_views} are needed: check that both clocks are one and in nanoseconds, and "
                 "record a minute of the board with images and IMU"
             )
         self.poses = BoardPoses(
@@ -162,7 +196,7 @@ class _Problem:
         """Return states from the rotations and the mean force."""
         T_board_cam = se3_inverse(self.poses.T_cam0_board)
         steps = np.diff(self._seconds)
-        frames = np.flatnonzero(steps < _MAX_STEP_S)
+        frames = np.flatnonzero(steps < _VIEWS.max_step_s)
         moved = se3_inverse(T_board_cam[frames]) @ T_board_cam[frames + 1]
         twists = se3_log(moved) / steps[frames, None]
         motion = CameraMotion(self.poses.times_ns, frames, twists)
@@ -194,12 +228,12 @@ class _Problem:
         """Return the optimum, by Gauss-Newton with Levenberg's damping."""
         damping = 1e-4
         before = np.inf
-        for _ in range(_STEPS):
+        for _ in range(_ITERATIONS.max_steps):
             steps = self._motions(at)
             weight = self._weights(at)
             H, g, cost = self._system(at, steps, weight)
             new = (at, 0.0)
-            while damping < _MAX_DAMPING:
+            while damping < _ITERATIONS.max_damping:
                 x = splu(csc_matrix(H + damping * _diagonal(H))).solve(g)
                 new = self._moved(at, x)
                 if self._cost(new, steps, weight) <= cost:
@@ -208,7 +242,7 @@ class _Problem:
                 damping *= 10
             damping = max(damping / 10, 1e-9)
             at = self._with_offset_applied(new)
-            if abs(before - cost) < _CONVERGED * cost:
+            if abs(before - cost) < _ITERATIONS.converged_share * cost:
                 return at
             before = cost
         return at
@@ -230,9 +264,11 @@ class _Problem:
             before = steps.residual(i, j, self._gravity)
             self._r_D_terms = np.zeros((*before.shape, len(self._chosen)))
             for k, term in enumerate(self._chosen.tolist()):
-                moved = replace(at, terms=at.terms + _TERM_STEP * np.eye(IMU_TERMS)[term])
+                moved = replace(
+                    at, terms=at.terms + _ITERATIONS.term_step * np.eye(IMU_TERMS)[term]
+                )
                 after = self._preintegrated(moved).residual(i, j, self._gravity)
-                self._r_D_terms[:, :, k] = (after - before) / _TERM_STEP
+                self._r_D_terms[:, :, k] = (after - before) / _ITERATIONS.term_step
         return _Motions(steps, at.terms, self._r_D_terms)
 
     def _moved(self, at: _States, x: FloatArray) -> tuple[_States, float]:
@@ -277,8 +313,8 @@ class _Problem:
 
     def _weights(self, at: _States) -> FloatArray:
         chi = np.mean(self._camera(at) ** 2, axis=1)
-        scale = max(float(np.median(chi)), _MIN_MEAN_CHI)
-        return np.asarray(1 / (1 + chi / (_WIDTH * scale)) / np.sqrt(scale))
+        scale = max(float(np.median(chi)), _VIEWS.min_mean_chi)
+        return np.asarray(1 / (1 + chi / (_VIEWS.quarter_chi * scale)) / np.sqrt(scale))
 
     def _inertial(self, at: _States, motions: _Motions) -> FloatArray:
         i = at.body.take(slice(None, -1))
@@ -310,9 +346,9 @@ class _Problem:
             for sign in (1.0, -1.0):
                 x = np.zeros(_STATE * K + self._shared)
                 column = slice(k, _STATE * K, _STATE) if k < _STATE else _STATE * K + k - _STATE
-                x[column] = sign * _NUMERIC_STEP
+                x[column] = sign * _ITERATIONS.numeric_step
                 ends.append(self._camera(*self._moved(at, x)))
-            D = (ends[0] - ends[1]) / (2 * _NUMERIC_STEP)
+            D = (ends[0] - ends[1]) / (2 * _ITERATIONS.numeric_step)
             if k < _STATE:
                 own[:, :, k] = D
             else:
@@ -333,8 +369,10 @@ class _Problem:
         columns = _STATE * states[:, None] + np.arange(_STATE)
         blocks = [(columns, scale * own), (common, scale * shared)]
         if with_scale:
-            ends = [self._camera(at, scale=1 + sign * _NUMERIC_STEP) for sign in (1.0, -1.0)]
-            by_scale = (ends[0] - ends[1]) / (2 * _NUMERIC_STEP)
+            ends = [
+                self._camera(at, scale=1 + sign * _ITERATIONS.numeric_step) for sign in (1.0, -1.0)
+            ]
+            by_scale = (ends[0] - ends[1]) / (2 * _ITERATIONS.numeric_step)
             last = np.full((K, 1), _STATE * K + self._shared)
             blocks.append((last, scale * by_scale[:, :, None]))
         rows.add(w[:, None] * self._camera(at), blocks)
@@ -422,24 +460,24 @@ def _weak(sigma: FloatArray) -> tuple[str, ...]:
     """Return what the motion hardly shows."""
     out: list[str] = []
     for k, axis in enumerate("xyz"):
-        if sigma[k] > _WEAK_M:
+        if sigma[k] > _WEAK.translation_m:
             out.append(
                 f"the IMU's position along its {axis} is known to {1e3 * sigma[k]:.0f} mm: turn "
                 "the rig faster, about the other two axes"
             )
-        if np.degrees(sigma[3 + k]) > _WEAK_ROTATION_DEG:
+        if np.degrees(sigma[3 + k]) > _WEAK.rotation_deg:
             out.append(
                 f"the rotation about the IMU's {axis} is known to "
                 f"{np.degrees(sigma[3 + k]):.2f} deg: turn the rig about the other axes, too"
             )
-    if sigma[6] > _WEAK_S:
+    if sigma[6] > _WEAK.time_s:
         out.append(f"the time offset is known to {1e3 * sigma[6]:.1f} ms: turn the rig faster")
     return tuple(out)
 
 
 def _size_findings(off: float, sigma: float) -> tuple[str, ...]:
     """Return whether the IMU sees a board of another size."""
-    if abs(off) < max(_SIZE_SIGMAS * sigma, _MIN_SIZE_SHARE):
+    if abs(off) < max(_SIZE.min_sigmas * sigma, _SIZE.min_share):
         return ()
     word = "larger" if off > 0 else "smaller"
     return (
@@ -464,7 +502,7 @@ def _whitening(covariance: FloatArray) -> FloatArray:
 
 
 def _diagonal(H: csc_matrix) -> csc_matrix:
-    values = np.maximum(H.diagonal(), _GAUGE)
+    values = np.maximum(H.diagonal(), _ITERATIONS.gauge_weight)
     index: npt.NDArray[np.int64] = np.arange(len(values))
     return csc_matrix((values, (index, index)), shape=H.shape)
 
@@ -495,7 +533,7 @@ class _Rows:
         J = coo_matrix((values, (at, by)), shape=(self._rows, self._columns)).tocsc()
         r = np.concatenate(self._residuals)
         H = csc_matrix(J.T @ J)
-        return H + _GAUGE * _eye(self._columns), -(J.T @ r), float(r @ r)
+        return H + _ITERATIONS.gauge_weight * _eye(self._columns), -(J.T @ r), float(r @ r)
 
 
 def _eye(size: int) -> csc_matrix:

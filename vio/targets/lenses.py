@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,10 +34,20 @@ LENSES: dict[str, tuple[DistortionModel, int]] = {
         key=lambda pair: pair[0].rank,
     )
 }
-_VIEWS = 16  # that are used for the choice, and every other corner of them
-_HOPELESS = 3.0  # times the least residual, beyond which a model is not judged further
-_RIVALS = 2  # models that are compared with the chosen one
-_CAP = 3.0  # times the median of the residuals, beyond which a corner counts as so far off
+
+
+class _ChoiceRules(NamedTuple):
+    """How a lens model is chosen."""
+
+    views: int = 16  # that are used for the choice, and every other corner of them
+    # times the least residual, beyond which a model is not judged further
+    hopeless_ratio: float = 3.0
+    rivals: int = 2  # models that are compared with the chosen one
+    # times the median of the residuals, beyond which a corner counts as so far off
+    cap_ratio: float = 3.0
+
+
+_CHOICE = _ChoiceRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +88,7 @@ def choose_lens(seen: Sightings, size: tuple[int, int]) -> LensChoice:
     Raises:
         CalibrationError: no model fits.
     """
-    few = seen.of_views(spread_views(seen.views, _VIEWS))
+    few = seen.of_views(spread_views(seen.views, _CHOICE.views))
     few = few.take(np.arange(0, len(few.uv), 2))
     scores = _scores(few, size, list(LENSES))
     if not scores:
@@ -103,7 +114,7 @@ def _scores(seen: Sightings, size: tuple[int, int], names: Sequence[str]) -> lis
         try:
             whole = one_camera(seen, size, model, count)
             least_px = min(least_px, float(whole.sigma_px[0]))
-            if whole.sigma_px[0] < _HOPELESS * least_px:
+            if whole.sigma_px[0] < _CHOICE.hopeless_ratio * least_px:
                 scores.append(_score(name, seen, whole))
         except (CalibrationError, np.linalg.LinAlgError):
             continue
@@ -134,7 +145,7 @@ def rivals_of(
         size: width and height of the images, pixels.
     """
     out: list[Rival] = []
-    for name in choice.equal[:_RIVALS]:
+    for name in choice.equal[: _CHOICE.rivals]:
         model, count = LENSES[name]
         try:
             other = one_camera(seen, size, model, count).at.cameras[0]
@@ -163,7 +174,7 @@ def _residuals_of(fit: RigFit, seen: Sightings, views: IntArray) -> FloatArray:
 def _squared(r: FloatArray, seen: Sightings, views: IntArray) -> FloatArray:
     """Mean squared residual (C,) of a coordinate in each view, far ones capped."""
     squared = 0.5 * np.sum(r**2, axis=1)
-    squared = np.minimum(squared, _CAP**2 * np.median(squared))
+    squared = np.minimum(squared, _CHOICE.cap_ratio**2 * np.median(squared))
     view = seen.of_views(views).view
     total = np.bincount(view, squared, minlength=len(views))
     return np.asarray(total / np.maximum(np.bincount(view, minlength=len(views)), 1))

@@ -9,6 +9,7 @@ publication 1065 (2008), sections 5.2.4 and 5.3.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,13 +18,30 @@ from vio.geometry.lie import FloatArray
 from vio.records import ImuDensities, ImuRecord, IntArray
 
 MOVING_FACTOR = 5.0  # by which densities at rest are multiplied for use while moving, see the page
-_MIN_AVERAGES = 9  # independent ones of the longest averaging time
-_PER_DECADE = 10  # averaging times
+
+
+class _AllanRules(NamedTuple):
+    """How densities are read from Allan deviations."""
+
+    min_averages: int = 9  # independent ones of the longest averaging time
+    per_decade: int = 10  # averaging times
+    min_s: float = 300.0
+    white_s: float = 1.0  # where white noise is read: averaging times up to it
+
+
+_ALLAN = _AllanRules()
 _INSTABILITY = 0.664  # lowest Allan deviation over B
-_MIN_SECONDS = 300.0
-_WHITE_S = 1.0  # where white noise is read: averaging times up to it
-_MAX_GAP_PERIODS = 3.0  # between samples
-_MAX_SHIFT = 10.0  # of a mean over a second against its neighbour, white sigmas: it moved
+
+
+class _RestRules(NamedTuple):
+    """When an IMU is at rest."""
+
+    max_gap_periods: float = 3.0  # between samples
+    # of a mean over a second against its neighbour, white sigmas: it moved
+    max_shift_sigmas: float = 10.0
+
+
+_REST = _RestRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +84,11 @@ def overlapping_allan(values: FloatArray, rate_hz: float, averages: IntArray) ->
 
 def allan_curve(values: FloatArray, rate_hz: float) -> AllanCurve:
     """Return the curve of one axis (N,) at averaging times spread over decades."""
-    longest = len(values) // _MIN_AVERAGES
+    longest = len(values) // _ALLAN.min_averages
     decades = np.log10(max(longest, 1))
-    averages = np.unique(np.logspace(0, decades, int(_PER_DECADE * decades) + 1).astype(np.int64))
+    averages = np.unique(
+        np.logspace(0, decades, int(_ALLAN.per_decade * decades) + 1).astype(np.int64)
+    )
     independent = len(values) / averages
     relative = 1 / np.sqrt(2 * np.maximum(independent - 1, 1))
     return AllanCurve(averages / rate_hz, overlapping_allan(values, rate_hz, averages), relative)
@@ -77,7 +97,7 @@ def allan_curve(values: FloatArray, rate_hz: float) -> AllanCurve:
 def axis_noise(curve: AllanCurve) -> AxisNoise:
     """Return the densities that a curve shows."""
     tau = curve.tau_s
-    at = np.flatnonzero(tau <= _WHITE_S)
+    at = np.flatnonzero(tau <= _ALLAN.white_s)
     white = curve.deviation[at] * np.sqrt(tau[at])
     weight = 1 / curve.relative_error[at] ** 2
     N = float(white @ weight / weight.sum())
@@ -129,15 +149,15 @@ def measure_noise(record: ImuRecord) -> ImuNoise:
         DataError: the record is too short, lacks samples, or the IMU was moved.
     """
     seconds = 1e-9 * (record.times_ns - record.times_ns[0])
-    if len(seconds) < 2 or seconds[-1] < _MIN_SECONDS:
+    if len(seconds) < 2 or seconds[-1] < _ALLAN.min_s:
         length = float(seconds[-1]) if len(seconds) else 0.0
         raise DataError(
-            f"the IMU's record has {length:.0f} s, and the noise needs {_MIN_SECONDS:.0f}: record "
+            f"the IMU's record has {length:.0f} s, and the noise needs {_ALLAN.min_s:.0f}: record "
             "an hour or more at rest, on a heavy table"
         )
     steps = np.diff(seconds)
     period = float(np.median(steps))
-    if steps.max() > _MAX_GAP_PERIODS * period:
+    if steps.max() > _REST.max_gap_periods * period:
         k = int(np.argmax(steps))
         raise DataError(
             f"samples of the IMU are missing for {steps[k]:.2f} s at second {seconds[k]:.1f}: "
@@ -158,7 +178,7 @@ def _check_rest(values: FloatArray, rate_hz: float) -> None:
     means = blocks.mean(axis=1)
     spread = float(np.median(blocks.std(axis=1))) / np.sqrt(size)
     jumps = np.abs(np.diff(means))
-    if jumps.max() > _MAX_SHIFT * max(spread, 1e-12):
+    if jumps.max() > _REST.max_shift_sigmas * max(spread, 1e-12):
         raise DataError(
             f"the IMU was moved at second {int(np.argmax(jumps))}: the noise needs a record at rest"
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,9 +13,17 @@ from vio.geometry.lie import FloatArray
 from vio.targets.description import Target
 
 _MM = 1000.0
-_MARGIN_MM = 15.0
-_RULER_MM = 25.0  # height of the strip below the board that holds ruler and words
-_TICK_MM = 10.0
+
+
+class _Page(NamedTuple):
+    """What is drawn beside the board."""
+
+    margin_mm: float = 15.0
+    ruler_mm: float = 25.0  # height of the strip below the board that holds ruler and words
+    tick_mm: float = 10.0
+
+
+_PAGE = _Page()
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,27 +39,27 @@ class Page:
 def page_of(target: Target) -> Page:
     """Lay out a board and, below it, a ruler of whole centimetres."""
     board = target.dark_rectangles() * _MM
-    shift = _MARGIN_MM - board[:, :2].min(axis=0)
+    shift = _PAGE.margin_mm - board[:, :2].min(axis=0)
     board = board + np.tile(shift, 2)
     right, bottom = board[:, 2:].max(axis=0).tolist()
     ruler_top = bottom + 8.0
-    length = _TICK_MM * max(int((right - _MARGIN_MM) / _TICK_MM), 1)
+    length = _PAGE.tick_mm * max(int((right - _PAGE.margin_mm) / _PAGE.tick_mm), 1)
     ticks = []
-    for x in np.arange(0.0, length + 0.5, _TICK_MM).tolist():
-        left = _MARGIN_MM + x
+    for x in np.arange(0.0, length + 0.5, _PAGE.tick_mm).tolist():
+        left = _PAGE.margin_mm + x
         ticks.append((left - 0.1, ruler_top, left + 0.1, ruler_top + 4.0))
-    line = (_MARGIN_MM - 0.1, ruler_top, _MARGIN_MM + length + 0.1, ruler_top + 0.2)
+    line = (_PAGE.margin_mm - 0.1, ruler_top, _PAGE.margin_mm + length + 0.1, ruler_top + 0.2)
     one = "tag with its border" if target.kind == "aprilgrid" else "square"
     words = (
-        (_MARGIN_MM, ruler_top + 9.0, f"ruler {length:g} mm; {target}"),
+        (_PAGE.margin_mm, ruler_top + 9.0, f"ruler {length:g} mm; {target}"),
         (
-            _MARGIN_MM,
+            _PAGE.margin_mm,
             ruler_top + 14.0,
             f"measure the side of a {one} over many of them, and write it into the target file",
         ),
     )
     rectangles = np.concatenate([board, np.array([*ticks, line])])
-    return Page(right + _MARGIN_MM, ruler_top + _RULER_MM, rectangles, words)
+    return Page(right + _PAGE.margin_mm, ruler_top + _PAGE.ruler_mm, rectangles, words)
 
 
 def printed_light(target: Target, texels_per_m: float, margin_m: float) -> FloatArray:

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,11 +35,19 @@ from vio.targets.corners import CornerDetector
 from vio.targets.views import View
 
 MAX_FRAMES = 80  # in which the board is looked for, spread over the recording
-_ASSUMED_STEP_NS = 1_000_000_000  # between the pairs of a folder of photographs
-_MIN_MOTION_HZ = 5.0  # of frames, where an IMU is calibrated
-_MAX_MOTION_FRAMES = 400
-_MEASURED = 5  # images whose size is measured
-_SAMPLES = 4  # frames that are kept to explain a failure
+
+
+class _FrameRules(NamedTuple):
+    """Which frames of a recording are used."""
+
+    assumed_step_ns: int = 1_000_000_000  # between the pairs of a folder of photographs
+    min_motion_hz: float = 5.0  # of frames, where an IMU is calibrated
+    max_motion_frames: int = 400
+    measured_images: int = 5  # images whose size is measured
+    kept_frames: int = 4  # frames that are kept to explain a failure
+
+
+_FRAMES = _FrameRules()
 
 Images = tuple[Image, ...]
 
@@ -111,7 +120,7 @@ def _flat_pairs(path: Path) -> ImagePairs | None:
 
 
 def _folder_of_pairs(path: Path, pairs: ImagePairs) -> RawRecording:
-    times = [k * _ASSUMED_STEP_NS for k in range(len(pairs))]
+    times = [k * _FRAMES.assumed_step_ns for k in range(len(pairs))]
 
     def load(chosen: Sequence[int]) -> Iterator[tuple[int, Images]]:
         for k in chosen:
@@ -167,7 +176,9 @@ def _size_of_pair(path: Path, left: Path, right: Path) -> tuple[int, int]:
 def _usual_size(files: Sequence[Path]) -> tuple[int, int]:
     """Return width and height that most of a few images have."""
     sizes: list[tuple[int, int]] = []
-    for k in np.unique(np.linspace(0, len(files) - 1, _MEASURED).astype(int)).tolist():
+    for k in np.unique(
+        np.linspace(0, len(files) - 1, _FRAMES.measured_images).astype(int)
+    ).tolist():
         try:
             image = load_gray(files[k])[0]
         except UnreadableImageError:
@@ -252,7 +263,7 @@ def film(
     samples: list[Images] = []
     sizes: tuple[tuple[int, int], ...] = ()
     frames = 0
-    between = max(len(chosen) // _SAMPLES, 1)
+    between = max(len(chosen) // _FRAMES.kept_frames, 1)
     workers = os.cpu_count() or 1
     loaded = raw.load(chosen)
     with ThreadPoolExecutor(workers) as pool:
@@ -277,4 +288,4 @@ def _frames_wanted(raw: RawRecording, *, has_imu: bool) -> int:
     if not has_imu or len(raw.times_ns) < 2:
         return MAX_FRAMES
     seconds = 1e-9 * (raw.times_ns[-1] - raw.times_ns[0])
-    return int(np.clip(_MIN_MOTION_HZ * seconds, MAX_FRAMES, _MAX_MOTION_FRAMES))
+    return int(np.clip(_FRAMES.min_motion_hz * seconds, MAX_FRAMES, _FRAMES.max_motion_frames))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -25,17 +25,25 @@ from vio.targets.homography import gray_at, homographies, mapped
 # Scale of the image in which candidates are looked for, and the pixels there by which light grows.
 _LOOKS = ((0.5, 3), (1.0, 3), (0.5, 1), (0.5, 5), (1.0, 5), (0.25, 1), (0.25, 3))
 _LOOKS_ALONE = ((0.5, 1), (1.0, 1), (0.25, 1), (1.0, 3))  # where nothing touches a marker
-_ENOUGH = 8  # markers, from which all others are found
-_ENOUGH_SHARE = 0.6  # of the board's markers
+
+
+class _MarkerRules(NamedTuple):
+    """When a marker is read."""
+
+    enough_markers: int = 8  # markers, from which all others are found
+    enough_share: float = 0.6  # of the board's markers
+    samples_per_side: int = 24  # along a side of what is correlated
+    margin_modules: float = 1.0  # modules of paper around a marker that are correlated with it
+    min_correlation: float = 0.75  # of a marker with its border and the paper around
+    min_code_correlation: float = 0.7  # correlation of what lies within the border
+    min_lead: float = 0.1  # of that over any other marker's, or turn's
+    min_contrast: float = 5.0  # standard deviation of the gray values
+    same_place_share: float = 0.5  # of a marker's side
+
+
+_MARKERS = _MarkerRules()
 _GROWTHS = (1.0, 1.12, 1.25, 1.4)  # of a candidate, which grown light has made smaller
-_SAMPLES = 24  # along a side of what is correlated
-_MARGIN = 1.0  # modules of paper around a marker that are correlated with it
 _BLURS = (0.3, 0.7, 1.2)  # standard deviations of the board's print, modules
-_MIN_CORRELATION = 0.75  # of a marker with its border and the paper around
-_MIN_CODE = 0.7  # correlation of what lies within the border
-_MIN_MARGIN = 0.1  # of that over any other marker's, or turn's
-_MIN_CONTRAST = 5.0  # standard deviation of the gray values
-_SAME_PLACE = 0.5  # of a marker's side
 
 
 Single: TypeAlias = npt.NDArray[np.float32]
@@ -71,7 +79,7 @@ class MarkerReader:
         dictionary = marker_dictionary(target.dictionary)
         self._detector: Any = cv2.aruco.ArucoDetector(dictionary, settings)
         markers = target.markers()
-        self._wanted = min(_ENOUGH, _ENOUGH_SHARE * len(markers))
+        self._wanted = min(_MARKERS.enough_markers, _MARKERS.enough_share * len(markers))
         self._looks = _LOOKS if target.kind == "aprilgrid" else _LOOKS_ALONE
         self._prints = _Prints(markers, target.border_bits)
 
@@ -106,7 +114,7 @@ def _each_once(found: Sequence[Read]) -> list[Read]:
     for one in sorted(found, key=lambda read: -read.correlation):
         other = best.setdefault(one.id, one)
         apart = float(np.linalg.norm(other.uv.mean(axis=0) - one.uv.mean(axis=0)))
-        if apart > _SAME_PLACE * max(one.side_px, other.side_px):
+        if apart > _MARKERS.same_place_share * max(one.side_px, other.side_px):
             elsewhere.add(one.id)
     return [one for one in best.values() if one.id not in elsewhere]
 
@@ -118,8 +126,13 @@ class _Prints:
         import cv2
 
         modules = len(markers[0].is_dark)
-        margin = _MARGIN / modules
-        steps = -margin + (1 + 2 * margin) * (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        margin = _MARKERS.margin_modules / modules
+        steps = (
+            -margin
+            + (1 + 2 * margin)
+            * (np.arange(_MARKERS.samples_per_side) + 0.5)
+            / _MARKERS.samples_per_side
+        )
         self._at = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         cells = np.floor(modules * steps).astype(int)
         inside = (cells >= 0) & (cells < modules)
@@ -131,7 +144,9 @@ class _Prints:
         looks: list[FloatArray] = []
         ids: list[int] = []
         turns: list[int] = []
-        sigma_samples = np.array(_BLURS) * _SAMPLES / (modules + 2 * _MARGIN)
+        sigma_samples = (
+            np.array(_BLURS) * _MARKERS.samples_per_side / (modules + 2 * _MARKERS.margin_modules)
+        )
         for marker in markers:
             dark = marker.is_dark[np.ix_(known, known)] & inside[:, None] & inside
             for sigma in sigma_samples.tolist():
@@ -153,18 +168,18 @@ class _Prints:
         grown = np.stack([centre + g * (quads - centre) for g in _GROWTHS], axis=1)
         values = self._sampled(image, grown.reshape(-1, 4, 2))
         whole = _correlation(values, self._whole_looks, self._whole)
-        likely = np.flatnonzero(whole.max(axis=1) > _MIN_CORRELATION)
+        likely = np.flatnonzero(whole.max(axis=1) > _MARKERS.min_correlation)
         # All markers have the border in common; the code tells them apart.
         code = np.full_like(whole, -1.0)
         by_code = _correlation(values[likely], self._code_looks, self._code)
-        code[likely] = np.where(whole[likely] > _MIN_CORRELATION, by_code, -1.0)
+        code[likely] = np.where(whole[likely] > _MARKERS.min_correlation, by_code, -1.0)
         out: list[Read] = []
         for n, scores in enumerate(code.reshape(len(quads), len(_GROWTHS), -1)):
             g, k = np.unravel_index(int(np.argmax(scores)), scores.shape)
             best = float(scores[g, k])
             others = (self._id != self._id[k]) | (self._turn != self._turn[k])
             second = float(scores[:, others].max(initial=0.0))
-            if best > _MIN_CODE and best - second > _MIN_MARGIN:
+            if best > _MARKERS.min_code_correlation and best - second > _MARKERS.min_lead:
                 # Turned by 90 degrees against the clock, the print's first corner comes last.
                 uv = np.roll(grown[n, g], self._turn[k], axis=0)
                 out.append(Read(int(self._id[k]), uv, best))
@@ -193,7 +208,7 @@ def _correlation(values: FloatArray, looks: Single, weight: FloatArray) -> Singl
     zero where there is no contrast.
     """
     rows, contrast = _unit_rows(values, weight)
-    return np.asarray((rows * (contrast > _MIN_CONTRAST)[:, None]) @ looks.T)
+    return np.asarray((rows * (contrast > _MARKERS.min_contrast)[:, None]) @ looks.T)
 
 
 def checkerboard_seeds(image: Image, target: Target) -> tuple[FloatArray, FloatArray]:

@@ -8,6 +8,7 @@ Reference: Zhang, A flexible new technique for camera calibration (2000), for th
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,10 +23,18 @@ from vio.targets.views import Sightings
 
 # focal lengths over the image's width that are tried
 _FOCAL_SHARES = (0.18, 0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
-_STARTS = 2  # of them that are adjusted
-_START_VIEWS = 8
-_START_STEPS = 12
-_MIN_ROWS = 6  # corners of a view that give a pose
+
+
+class _StartRules(NamedTuple):
+    """How a start is found."""
+
+    adjusted_starts: int = 2  # of them that are adjusted
+    views: int = 8
+    steps: int = 12
+    min_rows: int = 6  # corners of a view that give a pose
+
+
+_START = _StartRules()
 
 
 def new_camera(
@@ -54,7 +63,7 @@ def board_pose(camera: CameraModel, board_m: FloatArray, uv: FloatArray) -> Floa
     None: it is not determined.
     """
     rays, valid = unproject_pixel(camera, uv)
-    if valid.sum() < _MIN_ROWS:
+    if valid.sum() < _START.min_rows:
         return None
     x = rays[valid]
     plane = board_m[valid]
@@ -126,18 +135,18 @@ def one_camera(
     Raises:
         CalibrationError: no focal length fits the views.
     """
-    few = seen.of_views(_fullest(seen, _START_VIEWS))
+    few = seen.of_views(_fullest(seen, _START.views))
     rated: list[tuple[float, float]] = []
     for share in _FOCAL_SHARES:
         focal = share * size[0]
         rated.append((_misfit(new_camera(model, count, focal, size), few), focal))
     best: Adjusted | None = None
     least = np.inf
-    for misfit, focal in sorted(rated)[:_STARTS]:
+    for misfit, focal in sorted(rated)[: _START.adjusted_starts]:
         if not np.isfinite(misfit):
             continue
         camera = new_camera(model, count, focal, size)
-        found = _adjusted(camera, few, _START_STEPS)
+        found = _adjusted(camera, few, _START.steps)
         if found is None:
             continue
         cost = median(np.linalg.norm(found.residuals_px, axis=1))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,14 +45,23 @@ from vio.targets.views import Sightings
 
 DEPTH_M = 5.0  # where a pair's uncertainty is stated
 _GRID = (13, 9)  # pixels along width and height at which maps are made
-_COMPENSATED = 500  # corners by which a motion of the camera is determined
-_STEP_SIGMAS = 0.1  # of numerical differences
+
+
+class _CheckRules(NamedTuple):
+    """When calibrations disagree."""
+
+    compensated_corners: int = 500  # corners by which a motion of the camera is determined
+    step_sigmas: float = 0.1  # of numerical differences
+    # of halves that agree as stated; further apart, they inflate the sigmas
+    chance_probability: float = 0.99
+    unsynchronised_ratio: float = 1.5  # residual of the pair over that of the cameras alone
+    min_cell_share: float = 0.01  # of all corners, in a cell of the image
+
+
+_CHECKS = _CheckRules()
 _MEDIAN_LENGTH = 1.1774  # of a vector of two Gaussian components of unit variance
-_CHANCE = 0.99  # of halves that agree as stated; further apart, they inflate the sigmas
-_UNSYNCHRONISED = 1.5  # residual of the pair over that of the cameras alone
 MIN_TILT_DEG = 15.0
 CELLS = 3  # along each side of the image, which must hold corners
-_MIN_CELL_SHARE = 0.01  # of all corners, in a cell of the image
 _ROWS = ("upper", "middle", "lower")
 _COLS = ("left", "centre", "right")
 MIN_VIEWS = 8
@@ -143,7 +153,7 @@ def projection_sigma_from_views(
     model = fit.cameras[camera]
     lens = layout_of(fit.cameras).lenses[camera]
     rows = np.flatnonzero((seen.camera == camera) & found.used)
-    rows = rows[:: -(-len(rows) // _COMPENSATED)]
+    rows = rows[:: -(-len(rows) // _CHECKS.compensated_corners)]
     board = np.column_stack([seen.points_m, bow_shape(seen.points_m) @ fit.bow])
     T = fit.T_cam_cam0[camera] @ fit.T_cam0_board[seen.view[rows]]
     corners = np.einsum("rij,rj->ri", T[:, :3, :3], board[seen.point[rows]]) + T[:, :3, 3]
@@ -233,10 +243,10 @@ def depth_sigma(found: Adjusted, depth_m: float = DEPTH_M) -> FloatArray:
     values, vectors = np.linalg.eigh(found.covariance)
     total = np.zeros(int(both.sum()))
     for value, vector in zip(values, vectors.T, strict=True):
-        step = _STEP_SIGMAS * np.sqrt(max(value, 0.0)) * vector
+        step = _CHECKS.step_sigmas * np.sqrt(max(value, 0.0)) * vector
         ahead = depths(_shifted(fit, step), uv0[both], uv1[both])
         behind = depths(_shifted(fit, -step), uv0[both], uv1[both])
-        total += ((ahead - behind) / (2 * _STEP_SIGMAS)) ** 2
+        total += ((ahead - behind) / (2 * _CHECKS.step_sigmas)) ** 2
     out[both] = np.sqrt(total)
     return out
 
@@ -340,14 +350,16 @@ def _inflation(halves: Halves) -> float:
     in one healthy recording of five.
     Reference: Birge, The calculation of errors by the method of least squares (1932).
     """
-    by_chance = np.sqrt(chi_square_quantile(_CHANCE, halves.unknowns) / halves.unknowns)
+    by_chance = np.sqrt(
+        chi_square_quantile(_CHECKS.chance_probability, halves.unknowns) / halves.unknowns
+    )
     return max(halves.ratio, halves.map_ratio) if halves.ratio > by_chance else 1.0
 
 
 def _unsynchronised(found: Adjusted, alone_sigma_px: Sequence[float]) -> list[str]:
     pairs = zip(found.sigma_px.tolist(), alone_sigma_px, strict=True)
     worst = max(together / alone for together, alone in pairs)
-    if len(alone_sigma_px) < 2 or worst < _UNSYNCHRONISED:
+    if len(alone_sigma_px) < 2 or worst < _CHECKS.unsynchronised_ratio:
         return []
     return [
         f"corners fit each camera alone {worst:.1f} times better than the pair: left and right "
@@ -375,7 +387,7 @@ def coverage_findings(seen: Sightings, cameras: Sequence[CameraModel]) -> list[s
     for c, camera in enumerate(cameras):
         uv = seen.uv[seen.camera == c]
         counts = corners_by_part(uv, camera.width, camera.height)
-        few = np.flatnonzero(counts < _MIN_CELL_SHARE * len(uv)).tolist()
+        few = np.flatnonzero(counts < _CHECKS.min_cell_share * len(uv)).tolist()
         empty = [part_name(k) for k in few]
         if empty:
             image = f"{names[c]} image" if names[c] else "image"

@@ -4,15 +4,24 @@ long as that.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.numerics.robust import quantile
 from vio.records import FrameResult, Observations, StereoFrame
 
-_WIDTH_PX = 1240  # of the picture; larger images are made smaller
-_QUALITY = 85  # of the JPEG
-_BAR_PX = 26  # height of the legend
-_LEGEND_PX = 480  # least width of an image with one
+
+class _PictureRules(NamedTuple):
+    """How the picture is drawn."""
+
+    width_px: int = 1240  # of the picture; larger images are made smaller
+    quality: int = 85  # of the JPEG
+    bar_px: int = 26  # height of the legend
+    legend_px: int = 480  # least width of an image with one
+
+
+_PICTURE = _PictureRules()
 
 
 class AnnotatedImage:
@@ -44,7 +53,7 @@ class AnnotatedImage:
 
         frame, seen = self._kept
         assert frame.left is not None
-        zoom = min(1.0, _WIDTH_PX / frame.left.shape[1])
+        zoom = min(1.0, _PICTURE.width_px / frame.left.shape[1])
         image = cv2.cvtColor(frame.left, cv2.COLOR_GRAY2BGR)
         image = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
         disparity = np.where(seen.has_right, seen.z[:, 0] - seen.z[:, 2], 0.0)
@@ -60,9 +69,9 @@ class AnnotatedImage:
             colour = colour if has_right else (160, 160, 160)
             cv2.line(image, at, (round(16 * (u - long)), at[1]), colour, 1, cv2.LINE_AA, shift=4)
             cv2.circle(image, at, 16 * 3, colour, -1 if has_right else 1, cv2.LINE_AA, shift=4)
-        if image.shape[1] >= _LEGEND_PX:
+        if image.shape[1] >= _PICTURE.legend_px:
             image = np.vstack([image, _legend(image.shape[1], float(low), float(high))])
-        done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _PICTURE.quality])
         return data.tobytes() if done else None
 
 
@@ -81,7 +90,7 @@ def _legend(width: int, low: float, high: float) -> np.ndarray:
     """Return a bar (H, width, 3) with the colours and their disparities."""
     import cv2
 
-    bar = np.full((_BAR_PX, width, 3), 255, np.uint8)
+    bar = np.full((_PICTURE.bar_px, width, 3), 255, np.uint8)
     scale = slice(width // 2, width - 90)
     bar[6:-6, scale] = _coloured(np.linspace(0, 1, scale.stop - scale.start))
     texts = ((8, "disparity (strokes: to scale)"), (scale.start - 60, f"{low:.1f} px"))

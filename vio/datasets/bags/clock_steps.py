@@ -15,21 +15,39 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, IntArray
 
-_MIN_NS = 10_000_000  # smaller corrections are those of a clock that is steered
-_AROUND = 20  # messages on either side that tell how far stamps are behind the recorder's clock
+
+class _BackRules(NamedTuple):
+    """When stamps that go back are a step of the clock."""
+
+    min_step_ns: int = 10_000_000  # smaller corrections are those of a clock that is steered
+    # messages on either side that tell how far stamps are behind the recorder's clock
+    messages_around: int = 20
+    # messages are recorded within this time after they are stamped
+    recorded_within_ns: int = 100_000_000
+    alike_share: float = 0.25  # of a step, by which those of several topics may differ to be one
+    min_behind_share: float = 0.8  # of the messages after a step are behind by it
+    min_early_share: float = 0.5  # of the messages after a step whose stamps were given before it
+
+
+_BACK = _BackRules()
 _TOGETHER_NS = NS_PER_S  # steps of several topics within this time are one
-_NEAR_NS = 100_000_000  # messages are recorded within this time after they are stamped
-_ALIKE = 0.25  # of a step, by which those of several topics may differ to be one
-_MAX = 0.8  # of the messages after a step are behind by it
-_MIN_LEAP_NS = 100_000_000  # a leap that is less passes for a gap of some frames
-_MIN_LEAPING = 2  # streams that leap together
-_SHARE = 0.5  # of the messages after a step whose stamps were given before it
+
+
+class _LeapRules(NamedTuple):
+    """When stamps that leap ahead are a step of the clock."""
+
+    min_ns: int = 100_000_000  # a leap that is less passes for a gap of some frames
+    min_streams: int = 2  # streams that leap together
+
+
+_LEAP = _LeapRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +116,7 @@ def _leaps(stamps: Mapping[str, IntArray], logged: Mapping[str, IntArray]) -> li
     found = [leap for topic in stamps for leap in _leaps_of(topic, stamps[topic], logged[topic])]
     steps = []
     for together in _joined(found):
-        if len(together) < _MIN_LEAPING:
+        if len(together) < _LEAP.min_streams:
             continue
         best = max(together, key=lambda leap: len(stamps[leap.topic]))
         first = {leap.topic: leap.row for leap in together}
@@ -112,7 +130,7 @@ def _leaps(stamps: Mapping[str, IntArray], logged: Mapping[str, IntArray]) -> li
 def _goes_on(logged: IntArray, time_ns: int) -> bool:
     """Whether a topic has messages enough on either side of a time to show a leap."""
     before = int(np.searchsorted(logged, time_ns))
-    return min(before, len(logged) - before) >= _AROUND
+    return min(before, len(logged) - before) >= _BACK.messages_around
 
 
 def _leaps_of(topic: str, stamps: IntArray, logged: IntArray) -> list[_Found]:
@@ -120,13 +138,13 @@ def _leaps_of(topic: str, stamps: IntArray, logged: IntArray) -> list[_Found]:
     usual_ns = _usual_ns(stamps)
     gap_ns = np.diff(stamps) - np.diff(logged)  # that the recorder's clock did not see
     found = []
-    for row in (np.flatnonzero(gap_ns > max(_MIN_LEAP_NS, usual_ns)) + 1).tolist():
-        before = (logged - stamps)[max(row - _AROUND, 0) : row]
-        after = (logged - stamps)[row : row + _AROUND]
+    for row in (np.flatnonzero(gap_ns > max(_LEAP.min_ns, usual_ns)) + 1).tolist():
+        before = (logged - stamps)[max(row - _BACK.messages_around, 0) : row]
+        after = (logged - stamps)[row : row + _BACK.messages_around]
         size_ns = median(before) - median(after)
         late_ns = np.abs(np.concatenate([before - median(before), after - median(after)]))
-        is_steady = np.mean(late_ns < _ALIKE * size_ns) > _MAX
-        if is_steady and abs(size_ns - gap_ns[row - 1]) < _ALIKE * size_ns:
+        is_steady = np.mean(late_ns < _BACK.alike_share * size_ns) > _BACK.min_behind_share
+        if is_steady and abs(size_ns - gap_ns[row - 1]) < _BACK.alike_share * size_ns:
             found.append(_Found(topic, row, size_ns, int(logged[row])))
     return found
 
@@ -162,16 +180,16 @@ def _size_of_step(times: IntArray, logged: IntArray, row: int, last_ns: int) -> 
         last_ns: the last stamp before it.
     """
     size_ns = _fallen_behind(times, logged, row)
-    if size_ns < max(_MIN_NS, 0.5 * (last_ns - int(times[row]))):
+    if size_ns < max(_BACK.min_step_ns, 0.5 * (last_ns - int(times[row]))):
         return None
-    after = times[row : row + _AROUND]
+    after = times[row : row + _BACK.messages_around]
     after = after[after <= last_ns]
     half_ns = _usual_ns(np.unique(times)) / 2
     earlier = times[:row]
     if after.max() < earlier.min():  # before the recording began
         return size_ns
     same = (earlier >= after.min() - half_ns) & (earlier <= after.max() + half_ns)
-    return size_ns if same.sum() >= _SHARE * len(after) else None
+    return size_ns if same.sum() >= _BACK.min_early_share * len(after) else None
 
 
 def _usual_ns(times: IntArray) -> float:
@@ -183,12 +201,12 @@ def _fallen_behind(times: IntArray, logged: IntArray, row: int) -> float:
     """Return by how much more stamps are behind the recorder's clock after a message than before
     it; 0 where not all of those after it are.
     """
-    first = max(row - _AROUND, 0)
-    around = slice(first, row + _AROUND)
+    first = max(row - _BACK.messages_around, 0)
+    around = slice(first, row + _BACK.messages_around)
     behind = (logged[around] - times[around]).astype(np.float64)
     more = behind[row - first :] - median(behind[: row - first])
     size_ns = median(more)
-    return size_ns if np.mean(more > 0.5 * size_ns) > _MAX else 0.0
+    return size_ns if np.mean(more > 0.5 * size_ns) > _BACK.min_behind_share else 0.0
 
 
 def _joined(found: Sequence[_Found]) -> list[list[_Found]]:
@@ -197,7 +215,7 @@ def _joined(found: Sequence[_Found]) -> list[list[_Found]]:
     for step in sorted(found, key=lambda each: each.logged_ns):
         last = groups[-1] if groups else []
         alike = last and abs(step.size_ns - last[0].size_ns) <= max(
-            _ALIKE * last[0].size_ns, _MIN_NS
+            _BACK.alike_share * last[0].size_ns, _BACK.min_step_ns
         )
         near = last and step.logged_ns - last[0].logged_ns <= _TOGETHER_NS
         if alike and near and step.topic not in {each.topic for each in last}:
@@ -223,12 +241,14 @@ def _row_without_descent(
     """Return the first message after a step of a topic whose stamps did not go back, as its
     messages are further apart than the step; None: its clock was not set.
     """
-    low, high = np.searchsorted(logged, [begin_ns - _NEAR_NS, begin_ns + _NEAR_NS]).tolist()
+    low, high = np.searchsorted(
+        logged, [begin_ns - _BACK.recorded_within_ns, begin_ns + _BACK.recorded_within_ns]
+    ).tolist()
     if low == 0 or high == len(times):
         return None
     behind = (logged - times).astype(np.float64)
-    before = median(behind[max(low - _AROUND, 0) : low])
-    after = median(behind[high : high + _AROUND])
+    before = median(behind[max(low - _BACK.messages_around, 0) : low])
+    after = median(behind[high : high + _BACK.messages_around])
     if abs(after - before - size_ns) > 0.5 * size_ns:
         return None
     return low + int(np.argmax(behind[low:] > (before + after) / 2))

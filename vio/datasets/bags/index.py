@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,11 +35,28 @@ from vio.records import NS_PER_S, ImuRecord, IntArray, Trajectory, VelocitySampl
 
 __all__ = ["BagIndex", "Stamps", "camera_info_of", "index_bag", "info_topic", "stamp_of"]
 
-# An accelerometer's readings further apart than so many usual intervals, and so much time, are a
-# gap, over which its readings are not interpolated.
-_GAP_STEPS = 8.0
-_OF_EACH = 0.1  # least share of the messages with one sensor alone, where a topic mixes the two
-_ALONE = 0.9  # and of both together
+
+class _GapRules(NamedTuple):
+    """When an accelerometer's readings have a gap."""
+
+    # An accelerometer's readings further apart than so many usual intervals, and so much time, are a
+    # gap, over which its readings are not interpolated.
+    usual_intervals: float = 8.0
+    min_ns: int = 100_000_000
+
+
+_GAPS = _GapRules()
+
+
+class _MixedRules(NamedTuple):
+    """When a topic mixes the messages of two sensors."""
+
+    # least share of the messages with one sensor alone, where a topic mixes the two
+    min_share_of_each: float = 0.1
+    min_share_alone: float = 0.9  # and of both together
+
+
+_MIXED = _MixedRules()
 # Names of RealSense's recorder for the distortions that ROS has names for.
 _SDK_MODELS = {
     "none": "plumb_bob",
@@ -47,7 +64,6 @@ _SDK_MODELS = {
     "kannala brandt4": "equidistant",
 }
 _MOVING = "/tf, "  # how the moving frames are named among the streams
-_GAP_NS = 100_000_000
 _LEVEL_SAMPLES = 8  # images looked at for black and white, spread over the recording
 
 
@@ -226,7 +242,7 @@ def joined_record(
         return None
     after = np.clip(np.searchsorted(accel_ns, times), 1, len(accel_ns) - 1)
     steps = np.diff(accel_ns)
-    longest = max(_GAP_STEPS * float(np.median(steps)), _GAP_NS)
+    longest = max(_GAPS.usual_intervals * float(np.median(steps)), _GAPS.min_ns)
     inside = (times >= accel_ns[0]) & (times <= accel_ns[-1]) & (steps[after - 1] <= longest)
     if not inside.any():
         return None
@@ -456,7 +472,10 @@ def _split_mixed(index: BagIndex, roles: Roles) -> None:
     gyro_alone = ~values[:, 3:].any(axis=1)
     accel_alone = ~values[:, :3].any(axis=1) & ~gyro_alone
     fewer = min(gyro_alone.mean(), accel_alone.mean())
-    if fewer < _OF_EACH or (gyro_alone | accel_alone).mean() < _ALONE:
+    if (
+        fewer < _MIXED.min_share_of_each
+        or (gyro_alone | accel_alone).mean() < _MIXED.min_share_alone
+    ):
         return
     whole = index.imu
     index.imu = whole.taken(np.flatnonzero(gyro_alone), slice(0, 3))
@@ -523,7 +542,7 @@ def _stamped(name: str, rows: Rows, behind_ns: int) -> list[str]:
 def _begins_at_zero(rows: Rows) -> bool:
     """Return whether the stamps count from the first one, so that 0 is a time."""
     steps = np.diff(np.unique(np.array(rows.times_ns, dtype=np.int64)))
-    return len(steps) > 1 and int(steps[0]) <= _GAP_STEPS * float(np.median(steps[1:]))
+    return len(steps) > 1 and int(steps[0]) <= _GAPS.usual_intervals * float(np.median(steps[1:]))
 
 
 def _info(index: BagIndex, fields: Any, message: Message) -> None:

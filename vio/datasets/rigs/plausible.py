@@ -8,6 +8,7 @@ error.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,17 +16,24 @@ from vio.cameras.rig import Rig
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel
 
-# Ratio of twice the principal point to the image size, along both axes in one direction, beyond
-# which the images are of another size. One axis may be off by a tenth (KITTI's raw images), but of
-# twelve real cameras none is off by more than 0.02 along both in one direction. A smaller scaling
-# shows in the turns against a gyro alone (`vio.monitor.rotation_comparison`).
-_SCALED = 1.05
-# Ratio of the two focal lengths beyond which images were stretched
-_STRETCHED = 1.1
-# Likewise along one axis, as of images that were cropped
-_CROPPED = 1.3
-# tangent of half the field of view that no planar lens exceeds (170 degrees)
-_MAX_HALF_VIEW = 11.43
+
+class _ImageSizeRules(NamedTuple):
+    """When a calibration is of images of another size."""
+
+    # Ratio of twice the principal point to the image size, along both axes in one direction, beyond
+    # which the images are of another size. One axis may be off by a tenth (KITTI's raw images), but of
+    # twelve real cameras none is off by more than 0.02 along both in one direction. A smaller scaling
+    # shows in the turns against a gyro alone (`vio.monitor.rotation_comparison`).
+    scaled_ratio: float = 1.05
+    # Ratio of the two focal lengths beyond which images were stretched
+    stretched_ratio: float = 1.1
+    # Likewise along one axis, as of images that were cropped
+    cropped_ratio: float = 1.3
+    # tangent of half the field of view that no planar lens exceeds (170 degrees)
+    max_half_view_tangent: float = 11.43
+
+
+_IMAGE_SIZE = _ImageSizeRules()
 FAR_IMU_M = 10.0  # an IMU further from its camera is no length in metres
 # A board's square is 0.02 to 0.1 m and a rig's baseline 0.05 to 0.6 m, so that in squares a
 # baseline is seldom below 1, and in metres seldom above.
@@ -55,7 +63,7 @@ def checked_rig(rig: Rig, where: Path | str, *, size_stated: bool = True) -> Rig
 
 def _check_focal_length(camera: CameraModel, where: Path | str) -> None:
     """Raise CalibrationError where a planar lens would see more than any does."""
-    if not camera.lens.planar or camera.fu * _MAX_HALF_VIEW > camera.width / 2:
+    if not camera.lens.planar or camera.fu * _IMAGE_SIZE.max_half_view_tangent > camera.width / 2:
         return
     angle = np.degrees(2 * np.arctan2(camera.width / 2, camera.fu))
     raise CalibrationError(
@@ -84,7 +92,7 @@ def _aspect_doubt(camera: CameraModel, where: Path | str) -> str | None:
     cx cy.
     """
     ratio = camera.fu / camera.fv
-    if 1 / _STRETCHED <= ratio <= _STRETCHED:
+    if 1 / _IMAGE_SIZE.stretched_ratio <= ratio <= _IMAGE_SIZE.stretched_ratio:
         return None
     return (
         f"{where}: doubtful: its focal lengths {camera.fu:g} and {camera.fv:g} pixels differ, as of "
@@ -111,8 +119,10 @@ def _size_doubt(camera: CameraModel, where: Path | str) -> str | None:
     middle.
     """
     ratios = np.array([2 * camera.cu / camera.width, 2 * camera.cv / camera.height])
-    scaled = ratios.min() > _SCALED or ratios.max() < 1 / _SCALED
-    cropped = ratios.max() > _CROPPED or ratios.min() < 2 - _CROPPED
+    scaled = ratios.min() > _IMAGE_SIZE.scaled_ratio or ratios.max() < 1 / _IMAGE_SIZE.scaled_ratio
+    cropped = (
+        ratios.max() > _IMAGE_SIZE.cropped_ratio or ratios.min() < 2 - _IMAGE_SIZE.cropped_ratio
+    )
     if not (scaled or cropped):
         return None
     remedy = (

@@ -4,6 +4,8 @@ over all pairs.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 import pycolmap
@@ -27,11 +29,18 @@ from vio.offline.colmap.model import (
 )
 from vio.records import BoolArray, Image
 
-_RATIO = 0.8  # of the distances to the best and the second best descriptor
-_VIRTUAL_PX = 500.0  # focal length of the camera that projects rays to pixels
+
+class _PairRules(NamedTuple):
+    """Which matches of two images agree."""
+
+    max_ratio: float = 0.8  # of the distances to the best and the second best descriptor
+    virtual_px: float = 500.0  # focal length of the camera that projects rays to pixels
+    essential_px: float = 1.0
+
+
+_PAIRS = _PairRules()
 _VIRTUAL_SIZE = (1000, 1000)  # required by COLMAP; without effect
-_VIRTUAL_PARAMS = (_VIRTUAL_PX, _VIRTUAL_PX, 0.0, 0.0)
-_ESSENTIAL_PX = 1.0
+_VIRTUAL_PARAMS = (_PAIRS.virtual_px, _PAIRS.virtual_px, 0.0, 0.0)
 
 
 def sift_matches(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
@@ -53,7 +62,7 @@ def sift_matches(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
     best1 = np.argmin(distance, axis=1)
     best0 = np.argmin(distance, axis=0)
     two = np.partition(distance, 1, axis=1)[:, :2]
-    good = (best0[best1] == np.arange(len(keys0))) & (two[:, 0] < _RATIO**2 * two[:, 1])
+    good = (best0[best1] == np.arange(len(keys0))) & (two[:, 0] < _PAIRS.max_ratio**2 * two[:, 1])
     uv0, uv1 = (np.array([key.pt for key in keys], dtype=np.float64) for keys in (keys0, keys1))
     return uv0[good], uv1[best1[good]]
 
@@ -67,7 +76,7 @@ def relative_pose(matches: RayMatches) -> tuple[FloatArray, FloatArray] | None:
     pixels = _virtual_pixels(matches)
     camera = pinhole(LEFT, _VIRTUAL_SIZE, _VIRTUAL_PARAMS)
     options = pycolmap.RANSACOptions(
-        max_error=_ESSENTIAL_PX,
+        max_error=_PAIRS.essential_px,
         random_seed=SEED,
         min_num_trials=200,
         max_num_trials=2000,
@@ -131,7 +140,9 @@ def _virtual_pixels(matches: RayMatches) -> tuple[FloatArray, FloatArray]:
     """Return COLMAP's pixels (N, 2) of the rays of both cameras in pinhole cameras without
     distortion.
     """
-    left, right = (_VIRTUAL_PX * ray[:, :2] / ray[:, 2:] for ray in (matches.ray0, matches.ray1))
+    left, right = (
+        _PAIRS.virtual_px * ray[:, :2] / ray[:, 2:] for ray in (matches.ray0, matches.ray1)
+    )
     return left, right
 
 

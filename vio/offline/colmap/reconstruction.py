@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import pycolmap
@@ -26,14 +26,22 @@ from vio.records import BoolArray, IntArray
 Mapper: TypeAlias = Literal["incremental", "global"]
 _NEXT = (1, 2, 3, 5, 8, 16)  # index offsets of later keyframes that left images are matched with
 _CROSS_NEXT = (1,)  # likewise between right images and later left ones
-# keyframes up to which all left images are matched, so that a loop that the run missed is found
-_EXHAUSTIVE = 60
+
+
+class _ModelRules(NamedTuple):
+    """Which images are joined."""
+
+    # keyframes up to which all left images are matched, so that a loop that the run missed is found
+    exhaustive_images: int = 60
+    min_registered: int = 3
+    # keyframes across which a step of the path may be joined; those further apart are joined by a loop
+    linked_images: int = 6
+
+
+_MODEL = _ModelRules()
 # index offsets from both keyframes of a loop, whose left images are matched with one another
 _AROUND_LOOP = (-1, 0, 1)
-_MIN_REGISTERED = 3
 MIN_SHARED = 15  # points that two left images show, from which the model counts as joined there
-# keyframes across which a step of the path may be joined; those further apart are joined by a loop
-_LINK = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +129,7 @@ def pairs_to_match(names: ModelImages, loops: IntArray) -> list[tuple[str, str]]
     """Return the pairs of image files to match, each once."""
     count = len(names.left)
     out = list(zip(names.left, names.right, strict=True))
-    steps = range(1, count) if count <= _EXHAUSTIVE else _NEXT
+    steps = range(1, count) if count <= _MODEL.exhaustive_images else _NEXT
     out += [(names.left[k], names.left[k + step]) for step in steps for k in range(count - step)]
     out += [
         (names.right[k], names.left[k + step]) for step in _CROSS_NEXT for k in range(count - step)
@@ -170,7 +178,7 @@ def reconstruct(
         for image in model.images.values()
         if image.has_pose and image.name in place
     )
-    if len(found) < _MIN_REGISTERED:
+    if len(found) < _MODEL.min_registered:
         return None
     keyframes = np.array([k for k, _ in found], dtype=np.int64)
     points = _common_points(model, [names.left[k] for k in keyframes.tolist()])
@@ -199,7 +207,7 @@ def linked_steps(points: IntArray, keyframes: IntArray) -> BoolArray:
     """Return whether a model is joined from each keyframe (R,) to the next (R - 1,), by the
     points (R, R) shared.
     """
-    near = np.abs(keyframes[None, :] - keyframes[:, None]) <= _LINK
+    near = np.abs(keyframes[None, :] - keyframes[:, None]) <= _MODEL.linked_images
     joined = near & (points >= MIN_SHARED)
     return np.array([joined[:n, n:].any() for n in range(1, len(points))], dtype=np.bool_)
 
@@ -214,7 +222,7 @@ def _revisits(points: IntArray, keyframes: IntArray) -> IntArray:
 def _incremental_options(threads: int) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=SEED)
     options.multiple_models = options.extract_colors = False
-    options.min_model_size = _MIN_REGISTERED
+    options.min_model_size = _MODEL.min_registered
     options.ba_refine_focal_length = options.ba_refine_principal_point = (
         options.ba_refine_extra_params
     ) = False
