@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from vio.dataclass import dataclass
@@ -12,12 +14,20 @@ from vio.records import MotionPrior
 
 AGREEMENT_PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
 AGREEMENT_LIMIT = float(chi_square_quantile(AGREEMENT_PROBABILITY, 6))  # of its squared distance
-_BOUND_SIGMAS = 3.0  # of the bound of the disparities' error
-_PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
-# errors of neighbours have much in common: a fit is no better than that of so many points
-_INDEPENDENT_POINTS = 50
-# of the length of a fitted translation: depths of one frame have errors in common
-_SCALE_SIGMA = 0.01
+
+
+class _ErrorRules(NamedTuple):
+    """What motions that are fitted to points are off by."""
+
+    bound_sigmas: float = 3.0  # of the bound of the disparities' error
+    pixel_sigma: float = 0.5  # of a point's position by its depth and its track
+    # errors of neighbours have much in common: a fit is no better than that of so many points
+    independent_points: int = 50
+    # of the length of a fitted translation: depths of one frame have errors in common
+    scale_sigma: float = 0.01
+
+
+_ERRORS = _ErrorRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,15 +44,15 @@ class ExpectedMotion:
         """
         p = transform_points(T, p_prev)
         J = pixel_D_motion(self.camera, p).reshape(-1, 6)
-        points = min(len(p), _INDEPENDENT_POINTS)
-        fit = _PIXEL_SIGMA**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
+        points = min(len(p), _ERRORS.independent_points)
+        fit = _ERRORS.pixel_sigma**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
         moved_m2 = float(T[:3, 3] @ T[:3, 3])
-        fit[:3, :3] += _SCALE_SIGMA**2 * moved_m2 * np.eye(3)
+        fit[:3, :3] += _ERRORS.scale_sigma**2 * moved_m2 * np.eye(3)
         if self.disparity_error_px > 0.0:
             # a translation is off as its depths are; one that no sensor has measured is, too
             depth = float(np.median(depth_of(self.camera, p_prev)))
             f_baseline = self.camera.fu * self.camera.baseline_m
-            scale = self.disparity_error_px / _BOUND_SIGMAS * depth / f_baseline
+            scale = self.disparity_error_px / _ERRORS.bound_sigmas * depth / f_baseline
             if not self.prior.measured:
                 t = self.prior.T_curr_prev[:3, 3]
                 moved_m2 += float(t @ t)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from typing import NamedTuple
 
 from vio.findings import Finder, Finding
 from vio.frontend.columns import share_of
@@ -13,14 +14,21 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, MotionPrior
 
-_FRAMES = 5  # in a row before an object is reported …
-# … or so many of the last ones, where a decision was made: a slow one is seen in some of them only
-_RECENT_FRAMES = 15
-_EVENT_FRAMES = 2  # in a row before an object is known, and may hide the scene
-# of the points that the scene has, during an event, below which the object hides it …
-_HIDDEN_SHARE = 0.1
-_HIDDEN_FRAMES = 3  # … in so many frames in a row
-_CLEAR_FRAMES = 20  # without one before the next is another event
+
+class _EventRules(NamedTuple):
+    """When an object is an event that is reported, and when it hides the scene."""
+
+    frames: int = 5  # in a row before an object is reported …
+    # … or so many of the last ones, where a decision was made: a slow one is seen in some of them only
+    recent_frames: int = 15
+    known_frames: int = 2  # in a row before an object is known, and may hide the scene
+    # of the points that the scene has, during an event, below which the object hides it …
+    hidden_share: float = 0.1
+    hidden_frames: int = 3  # … in so many frames in a row
+    clear_frames: int = 20  # without one before the next is another event
+
+
+_EVENT = _EventRules()
 
 
 class ObjectReport(Finder):
@@ -31,7 +39,7 @@ class ObjectReport(Finder):
     def __init__(self) -> None:
         super().__init__()
         # squared distances from the prediction of motions that older points support
-        self._usual = deque[float](maxlen=_CLEAR_FRAMES)
+        self._usual = deque[float](maxlen=_EVENT.clear_frames)
         self._frames = 0  # with an object, in a row
         self._since = 0  # the first of them
         self._decided = deque[int]()  # recent frames in which it was told from the scene
@@ -81,16 +89,16 @@ class ObjectReport(Finder):
         """Return whether a known object has left too few points of the scene for some frames, so
         that none is used.
         """
-        hidden = self._active and float(motions.motion.inliers.mean()) < _HIDDEN_SHARE
+        hidden = self._active and float(motions.motion.inliers.mean()) < _EVENT.hidden_share
         self._hidden = self._hidden + 1 if hidden else 0
-        if self._hidden >= _HIDDEN_FRAMES and not self._hidden_reported:
+        if self._hidden >= _EVENT.hidden_frames and not self._hidden_reported:
             self._hidden_reported = True
             message = (
-                f"frame {index}: fewer than {100 * _HIDDEN_SHARE:.0f} % of the points are left of "
+                f"frame {index}: fewer than {100 * _EVENT.hidden_share:.0f} % of the points are left of "
                 "the scene: the object hides it, and no feature is used"
             )
             self._found.append(Finding("object-hides-scene", message, index, lasts=True))
-        return self._hidden >= _HIDDEN_FRAMES
+        return self._hidden >= _EVENT.hidden_frames
 
     def frame(self, index: int, motions: TwoMotions) -> None:
         """Take the motions of a frame."""
@@ -105,22 +113,22 @@ class ObjectReport(Finder):
             self._report_unsupported(index, motions)
             return
         undecided = motions.decision == "undecided"
-        self._active = self._active or (self._frames >= _EVENT_FRAMES and not undecided)
+        self._active = self._active or (self._frames >= _EVENT.known_frames and not undecided)
         if not undecided:
             self._decided.append(index)
-        while self._decided and self._decided[0] <= index - _RECENT_FRAMES:
+        while self._decided and self._decided[0] <= index - _EVENT.recent_frames:
             self._decided.popleft()
-        often = not undecided and len(self._decided) >= _FRAMES
+        often = not undecided and len(self._decided) >= _EVENT.frames
         if often:
             self._since = min(self._since, self._decided[0])
-        if (often or self._frames >= _FRAMES) and self._reported is None:
+        if (often or self._frames >= _EVENT.frames) and self._reported is None:
             self._report(index, motions)
 
     def _no_object(self, index: int) -> None:
         self._frames = 0
         self._clear = self._clear + 1
-        self._active = self._active and self._clear < _FRAMES
-        if self._reported is None or self._clear < _CLEAR_FRAMES:
+        self._active = self._active and self._clear < _EVENT.frames
+        if self._reported is None or self._clear < _EVENT.clear_frames:
             return
         message = f"frame {index}: no object covers much of the image any more"
         self._found.append(Finding(self._reported, message, index, ended=True))

@@ -5,7 +5,7 @@ rectification.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,7 @@ _BITS = 5  # of the parts of a pixel, 32, in which OpenCV's remap counts
 # Standard deviation of a virtual disparity over that of the pixels of a track, which are those of
 # two exposures.
 _DISPARITY_SIGMAS = 2**0.5
+_PIXEL_SIGMA_PX = 0.2  # of a tracked feature; what the filter learns on real images is 0.1 to 0.3
 # maps for cv2.remap: u and v, or those of `fixed_point`
 LookUp: TypeAlias = tuple[npt.NDArray[Any], npt.NDArray[Any]]
 
@@ -189,7 +190,7 @@ def with_virtual_baseline(camera: StereoCamera, depth_noise: float) -> StereoCam
         camera: undistorted.
         depth_noise: k, 1/m; 0.0012 to 0.0019 for structured light.
     """
-    baseline_m = _DISPARITY_SIGMAS * _PIXELS.pixel_sigma_px / (camera.fu * depth_noise)
+    baseline_m = _DISPARITY_SIGMAS * _PIXEL_SIGMA_PX / (camera.fu * depth_noise)
     return replace(camera, baseline_m=baseline_m, kind="rgbd")
 
 

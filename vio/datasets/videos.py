@@ -15,7 +15,7 @@ import contextlib
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,8 +41,16 @@ _NAMES = (
     ("video_0", "video_1"),
 )
 _RATES = (1.0, 1000.0)  # frames per second that a file can plausibly state
-_EVEN_NS = 2_000_000  # frames this close to an even grid have a constant rate
-_PAIRED = 0.25  # of the usual interval: how far apart the times of a pair may be
+
+
+class _TimeRules(NamedTuple):
+    """When the times of frames are even, and when two frames are a pair."""
+
+    even_ns: int = 2_000_000  # frames this close to an even grid have a constant rate
+    paired: float = 0.25  # of the usual interval: how far apart the times of a pair may be
+
+
+_TIMES = _TimeRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +170,7 @@ def _stated_times(file: Path) -> IntArray | None:
 def _is_even(times_ns: IntArray, rate_hz: float) -> bool:
     """Whether times follow a rate."""
     grid_ns = times_ns[0] + np.arange(len(times_ns)) * (NS_PER_S / rate_hz)
-    return bool(np.abs(times_ns - grid_ns).max() < _EVEN_NS)
+    return bool(np.abs(times_ns - grid_ns).max() < _TIMES.even_ns)
 
 
 def _times(
@@ -210,7 +218,7 @@ def _uneven_times(
     )
     usual_ns = float(np.median(np.diff(left_ns)))
     nearest = np.searchsorted(right_ns[:-1] + np.diff(right_ns) // 2, left_ns)
-    paired = np.flatnonzero(np.abs(right_ns[nearest] - left_ns) <= _PAIRED * usual_ns)
+    paired = np.flatnonzero(np.abs(right_ns[nearest] - left_ns) <= _TIMES.paired * usual_ns)
     rows = np.column_stack([paired, nearest[paired]])
     rows = rows[np.unique(rows[:, 1], return_index=True)[1]]
     if not len(rows):
