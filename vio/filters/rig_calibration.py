@@ -42,6 +42,7 @@ class _RigRules(NamedTuple):
     columns_by_rows: float = 3.0
     # how much larger the rows' field must become for what was learned of the columns to be in doubt
     rows_moved_sigmas: float = 2.0
+    field_samples: int = 9  # along a row, of the field whose size is measured
 
 
 _RIG = _RigRules()
@@ -79,6 +80,40 @@ def constant_sigmas(settings: MsckfSettings) -> FloatArray:
     """
     centre = _RIG.principal_point_share * settings.stereo_focal_sigma
     return np.array([settings.stereo_baseline_sigma, settings.stereo_focal_sigma, centre, centre])
+
+
+def scale_sigma(settings: MsckfSettings) -> float:
+    """Standard deviation of the scale by baseline and focal length as they are calibrated, over
+    it.
+    """
+    return float(np.hypot(settings.stereo_baseline_sigma, settings.stereo_focal_sigma))
+
+
+def field_doubt(
+    camera: StereoCamera, settings: MsckfSettings, field: FloatArray, covariance: FloatArray
+) -> float:
+    """Return what the field of disparities lets the scale be off by beside `scale_sigma`, as a
+    standard deviation over it, equation (S6).
+
+    One board and one fit gave all constants of a rig. Where the mean disparity is off by k times
+    what a usual yaw moves it by, baseline and focal length, which images alone do not show, are as
+    likely k times as far off as usual.
+
+    Args:
+        camera: the rectified pair.
+        settings: with the standard deviations of a usual calibration.
+        field: (T,) coefficients of (R3), those of the columns first, focal lengths.
+        covariance: (T, T) of them.
+    """
+    usual = stereo_yaw_rad(settings)
+    if camera.projection != "pinhole":
+        return 0.0
+    x = (np.linspace(0.0, camera.width, _RIG.field_samples) - camera.cu) / camera.fu
+    mean_D_field = np.array([1.0, x.mean(), (x**2).mean(), (x**4).mean()])
+    mean = float(mean_D_field @ field[:4])
+    noise = float(mean_D_field @ covariance[:4, :4] @ mean_D_field)
+    squared = (mean**2 - noise) / usual**2
+    return scale_sigma(settings) * float(np.sqrt(max(squared - 1.0, 0.0)))
 
 
 class RigCalibration:
@@ -182,14 +217,25 @@ class RigCalibration:
         return out
 
     def scale_doubt(self, window: Window) -> float:
-        """By what the motion sensor suggests that the baseline is off, as a standard deviation over
-        it, beside the one considered; 0 where the settings say that it is known.
+        """By what motion sensor and field suggest that the baseline is off, as a standard deviation
+        over it, beside the one considered; 0 where the settings say that it is known.
         """
+        if self._sigmas[0] == 0.0 or "stereo_scale" in window.state:
+            return 0.0
         test = window.prior.scale_test
-        return 0.0 if test is None or self._sigmas[0] == 0.0 else test.doubt()
+        by_sensor = 0.0 if test is None else test.doubt()
+        return float(np.hypot(by_sensor, self._field_doubt(window)))
+
+    def _field_doubt(self, window: Window) -> float:
+        """What `field_doubt` returns of a window."""
+        if "stereo_field" not in window.state:
+            return 0.0
+        rows = window.state["stereo_field"]
+        covariance = window.prior.P[rows, rows]
+        return field_doubt(self.camera, self.settings, window.calibration.stereo, covariance)
 
     def reported_uncertainty(self, window: Window, V: FloatArray) -> FloatArray:
-        """Return `uncertainty` (k, k) with what the motion sensor says against the scale."""
+        """Return `uncertainty` (k, k) with what sensor and field say against the scale."""
         by_scale = V[:, 0] * self.scale_doubt(window)
         return self.uncertainty(window, V) + np.outer(by_scale, by_scale)
 

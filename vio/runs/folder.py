@@ -29,6 +29,7 @@ from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.atomic import atomic_folder, check_own
 from vio.files.printable import json_text, printable
 from vio.files.trajectories import in_first_cam0, write_kitti, write_tum
+from vio.filters.rig_calibration import field_doubt, scale_sigma
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.numerics import robust
@@ -515,7 +516,13 @@ def rig_scale_sigma(result: RunResult) -> float | None:
         or result.estimates[-1].stereo_scale is not None
     ):
         return None
-    return float(np.hypot(settings.stereo_baseline_sigma, settings.stereo_focal_sigma))
+    field = result.estimates[-1].stereo_field
+    doubt = (
+        0.0
+        if field is None or settings.stereo_baseline_sigma == 0.0
+        else field_doubt(camera, settings, field.coefficients, field.covariance)
+    )
+    return float(np.hypot(scale_sigma(settings), doubt))
 
 
 def camera_imu(result: RunResult) -> dict[str, Any] | None:
