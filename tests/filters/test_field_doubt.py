@@ -34,6 +34,12 @@ def test_scale_and_disparities_are_off_alike(times: float) -> None:
     assert np.hypot(_doubt(times * USUAL), usual) == pytest.approx(times * usual)
 
 
+def test_features_without_a_known_size_of_the_images_are_doubted_as_well() -> None:
+    unknown = replace(CAMERA, width=None, height=None)
+    field = np.array([3.0 * USUAL, *np.zeros(7)])
+    assert field_doubt(unknown, MsckfSettings(), field, np.zeros((8, 8))) > 0.0
+
+
 def test_what_noise_explains_is_no_error_of_the_rig() -> None:
     assert _doubt(2.0 * USUAL, sigma=2.0 * USUAL) == 0.0
 

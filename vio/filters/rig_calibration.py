@@ -108,7 +108,8 @@ def field_doubt(
     usual = stereo_yaw_rad(settings)
     if camera.projection != "pinhole":
         return 0.0
-    x = (np.linspace(0.0, camera.width, _RIG.field_samples) - camera.cu) / camera.fu
+    width = 2.0 * camera.cu if camera.width is None else camera.width
+    x = (np.linspace(0.0, width, _RIG.field_samples) - camera.cu) / camera.fu
     mean_D_field = np.array([1.0, x.mean(), (x**2).mean(), (x**4).mean()])
     mean = float(mean_D_field @ field[:4])
     noise = float(mean_D_field @ covariance[:4, :4] @ mean_D_field)
