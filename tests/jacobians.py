@@ -28,6 +28,7 @@ TESTED_JACOBIANS = {
     "vio.filters.stereo_calibration.rows_D_common",
     "vio.filters.vislam.z_D_landmark",
     "vio.filters.vislam.z_D_xi",
+    "vio.frontend.expected_motion.pixel_D_motion",
     "vio.geometry.distortion.uv_D_camera",
     "vio.geometry.distortion.uv_D_point",
     "vio.geometry.stereo.depth_D_yz",

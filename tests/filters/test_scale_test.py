@@ -177,3 +177,12 @@ def test_what_an_imu_says_of_a_wrong_baseline_is_in_the_covariance() -> None:
         sigma_m = float(np.sqrt(np.trace(last.covariance[:3, :3])))
         share = sigma_m / float(np.linalg.norm(last.T_world_imu[:3, 3]))
         assert low <= share <= high
+
+
+def test_what_the_sensors_noise_explains_is_no_doubt() -> None:
+    """A second of slow motion: its information is that of the accelerometer's noise."""
+    test = measured(0.6, 1 / 6)
+    assert test.doubt() > 0.05
+    for _ in range(40):
+        test.end_frame()
+    assert test.doubt() == 0.0

@@ -118,19 +118,20 @@ class ScaleTest:
         """By what the scale may be off beside what is reported, as a standard deviation over it.
 
         The calibration is right, or it is not and the scale is anywhere: a mixture of two normal
-        distributions, whose weights follow from what was measured by Bayes' rule. Without a
-        measurement it is zero: then the calibration counts.
+        distributions, whose weights follow from what was measured by Bayes' rule, less what the
+        sensor's noise explains. Without a measurement it is zero: then the calibration counts.
         """
         measured = self._information - _SCALE.log_sigma**-2
         if measured <= 0.0:
             return 0.0
-        log = self._vector / measured
+        by_noise = _SCALE.information_by_noise * self._frames / measured
+        log = max(abs(self._vector) / measured - by_noise, 0.0)
         variances = np.array([_USUAL_SIGMA, _SCALE.log_sigma]) ** 2 + 1.0 / measured
         squared = log**2 / variances
         likelihood = np.exp(-0.5 * (squared - squared[1]))  # over that of a wrong calibration
         weights = likelihood / np.sqrt(variances) * [1.0 - _WRONG_SHARE, _WRONG_SHARE]
         wrong = float(weights[1] / weights.sum())
-        return float(np.sqrt(wrong) * abs(self.estimate()[0]))
+        return float(np.sqrt(wrong)) * log * measured / self._information
 
     @property
     def _contradicted(self) -> bool:

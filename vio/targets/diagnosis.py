@@ -84,7 +84,7 @@ def diagnose(images: Sequence[Image], target: Target) -> str | None:
                 "the images are inverted, dark where the board is light: record them as the "
                 "camera sees"
             )
-    is_seen = 2 * int(np.count_nonzero(found)) > len(found)
+    is_seen = 0 < len(found) <= 2 * int(np.count_nonzero(found))
     return _other_kind(images, target, is_seen=is_seen)
 
 
