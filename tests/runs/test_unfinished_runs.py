@@ -33,16 +33,17 @@ from vio.config import Config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.observation_log import write_observation_log
 from vio.errors import DataError, EstimationError
-from vio.files.tables import Table
+from vio.files.tables import KeptRows, Table
 from vio.files.trajectories import read_trajectory
 from vio.filters.msckf import Msckf
 from vio.geometry.stereo import StereoCamera
+from vio.monitor.integrity import Mark
 from vio.protocols import Dataset
 from vio.records import Estimate, Recording, StereoFieldEstimate, StereoScaleEstimate
 from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
 from vio.runs.folder import growing_folder
 from vio.runs.pipeline import RunControl, RunResult, run
-from vio.runs.recorder import GrowingFolder
+from vio.runs.recorder import GrowingFolder, RunRecorder
 from vio.runs.stated import RunRequest
 from vio.runs.tables import estimate_of, estimate_row
 from vio.sim.effects import CLEAN
@@ -591,6 +592,66 @@ def test_a_run_that_dies_after_its_checkpoint_goes_on_with_estimates_that_were_s
     _assert_same(
         whole, run(open_dataset(flight_log), config, control=RunControl(folder, resume=True))
     )
+
+
+def test_a_run_that_dies_while_it_marks_earlier_frames_goes_on_from_its_checkpoint(
+    flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows that the checkpoint rests on are replaced in their file before there is another."""
+    mark = RunRecorder.mark
+    dies = False
+
+    def marking(self: RunRecorder, marks: Any) -> None:
+        at = len(self) == 13
+        mark(self, (Mark(2, 8, "degraded", "frames-missing"),) if at else marks)
+        if at and dies:
+            raise RuntimeError("died")
+
+    monkeypatch.setattr(RunRecorder, "mark", marking)
+    monkeypatch.setattr(
+        "vio.runs.recorder._TIMES", replaced("vio.runs.recorder._TIMES", checkpoint_s=0.0)
+    )
+    folder = GrowingFolder(tmp_path / "run", {})
+    whole = run(open_dataset(flight_log), Config())
+    assert whole.estimates.column("integrity")[:9].tolist() == [0, 0, *[1] * 6, 0]
+    dies = True
+    with pytest.raises(RuntimeError, match="died"):
+        run(open_dataset(flight_log), Config(), control=RunControl(folder))
+    dies = False
+    again = run(open_dataset(flight_log), Config(), control=RunControl(folder, resume=True))
+    _assert_same(whole, again)
+
+
+@pytest.mark.parametrize("of_checkpoint", [True, False])
+def test_rows_of_a_checkpoint_are_put_back(of_checkpoint: bool, tmp_path: Path) -> None:
+    table = Table(ROW, tmp_path / "t.npy")
+    table.append(_rows(*range(10)))
+    kept = KeptRows(tmp_path / "kept.npy", ROW)
+    for rows in ([2, 3], [3, 7]):  # the second time, 3 is no longer that of the checkpoint
+        kept.keep(table, rows, 123)
+        for k in rows:
+            table.replace(k, _rows(90))
+    table.close()
+    checkpoint = 123 if of_checkpoint else 124
+    KeptRows(tmp_path / "kept.npy", ROW).take_back(tmp_path / "t.npy", checkpoint)
+    held = np.load(tmp_path / "t.npy")["a"].tolist()
+    assert held == ([*range(10)] if of_checkpoint else [0, 1, 90, 90, 4, 5, 6, 90, 8, 9])
+
+
+def test_kept_rows_that_are_damaged_are_named(tmp_path: Path) -> None:
+    table = Table(ROW, tmp_path / "t.npy")
+    table.append(_rows(*range(4)))
+    kept = KeptRows(tmp_path / "kept.npy", ROW)
+    kept.keep(table, [3], 5)
+    table.close()
+    shorter = Table(ROW, tmp_path / "short.npy")
+    shorter.append(_rows(0))
+    shorter.close()
+    with pytest.raises(DataError, match=r"kept\.npy: is damaged \(it has rows that the table"):
+        KeptRows(tmp_path / "kept.npy", ROW).take_back(tmp_path / "short.npy", 5)
+    (tmp_path / "kept.npy").write_bytes(b"x")
+    with pytest.raises(DataError, match=r"kept\.npy: is damaged"):
+        KeptRows(tmp_path / "kept.npy", ROW).take_back(tmp_path / "t.npy", 5)
 
 
 @pytest.mark.parametrize("kind", ["symbolic", "hard"])

@@ -6,6 +6,7 @@ axis), so a program that dies leaves a file with all rows of its last flush.
 
 from __future__ import annotations
 
+import io
 import os
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import DataError
-from vio.files.atomic import open_own
+from vio.files.atomic import atomic_write_bytes, check_own, open_own
 
 _CHUNK = 10_000  # rows of which a checksum is computed at a time
 Rows = np.ndarray  # structured (N,)
@@ -178,6 +179,72 @@ def check_table(path: Path, dtype: np.dtype, keep: int, summed: tuple[int, int] 
     ) as error:  # NumPy takes a damaged header for one of Python 2
         reason = " ".join(str(error).split())
         raise DataError(f"{path}: is damaged ({reason}); repeat the run from its start") from error
+
+
+class KeptRows:
+    """Rows of a table's file as a checkpoint has them, kept in a file beside it where they are
+    replaced: a program that dies before the next checkpoint goes on from that one.
+    """
+
+    def __init__(self, path: Path, dtype: np.dtype) -> None:
+        """Begin without rows; `path` is the file's, `dtype` that of the table's rows."""
+        self._path = path
+        self._dtype = np.dtype([("checkpoint", "<u4"), ("index", "<i8"), ("row", dtype)])
+        self._rows: dict[int, Rows] = {}
+
+    def keep(self, table: Table, indices: Sequence[int], checkpoint: int) -> None:
+        """Keep rows of a table, but those that were, before they are replaced.
+
+        `checkpoint` tells which one has them.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
+        new = [k for k in indices if k not in self._rows]
+        if not new:
+            return
+        self._rows.update({k: np.array(table.rows(k, k + 1)) for k in new})
+        kept = np.zeros(len(self._rows), dtype=self._dtype)
+        kept["checkpoint"] = checkpoint
+        kept["index"] = list(self._rows)
+        kept["row"] = np.concatenate(list(self._rows.values()))
+        buffer = io.BytesIO()
+        np.save(buffer, kept, allow_pickle=False)
+        atomic_write_bytes(self._path, buffer.getvalue())
+
+    def forget(self) -> None:
+        """Remove the file: the rows as they are now are those of a checkpoint."""
+        if self._rows:
+            self._rows = {}
+            self._path.unlink(missing_ok=True)
+
+    def take_back(self, path: Path, checkpoint: int) -> None:
+        """Put what was kept back into a table's file, where it is of this checkpoint.
+
+        Raises:
+            DataError: a file is damaged, or a link.
+        """
+        if not self._path.is_file():
+            return
+        check_own(self._path)
+        try:
+            kept = np.load(self._path, allow_pickle=False)
+            if kept.dtype != self._dtype:
+                raise ValueError("it has rows of another kind")
+            kept = kept[kept["checkpoint"] == checkpoint]
+            held = np.load(path, mmap_mode="r", allow_pickle=False)
+            if len(kept) and not 0 <= kept["index"].min() <= kept["index"].max() < len(held):
+                raise ValueError("it has rows that the table has not")
+            start = held.offset
+            with open_own(path, "r+b") as stream:
+                for one in kept:
+                    stream.seek(start + int(one["index"]) * self._dtype["row"].itemsize)
+                    stream.write(one["row"].tobytes())
+        except (OSError, ValueError, EOFError, TokenError, AttributeError) as error:
+            reason = " ".join(str(error).split())
+            raise DataError(
+                f"{self._path}: is damaged ({reason}); repeat the run from its start"
+            ) from error
 
 
 def _checksum(rows: Rows, crc: int) -> int:

@@ -84,6 +84,15 @@ def save_checkpoint(
     atomic_write_bytes(path, b"".join((b"%08x" % zlib.crc32(body), body)))
 
 
+def checkpoint_id(path: Path) -> int:
+    """Return the checksum of a checkpoint, which tells it from others; 0: there is none."""
+    try:
+        with path.open("rb") as stream:
+            return int(stream.read(8), 16)
+    except (OSError, ValueError):
+        return 0
+
+
 def load_checkpoint(
     path: Path, dataset: Dataset | None, inputs: Mapping[str, Any] | None = None
 ) -> Any:

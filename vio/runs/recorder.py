@@ -22,7 +22,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text, check_own, open_own
-from vio.files.tables import Records, Rows, Table, check_table
+from vio.files.tables import KeptRows, Records, Rows, Table, check_table
 from vio.files.trajectories import tum_text
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
@@ -39,7 +39,12 @@ from vio.records import (
     MotionSample,
     Observations,
 )
-from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
+from vio.runs.checkpoint import (
+    NotSavableError,
+    checkpoint_id,
+    load_checkpoint,
+    save_checkpoint,
+)
 from vio.runs.files import CHECKPOINT, RunFile
 from vio.runs.tables import (
     ESTIMATE,
@@ -128,6 +133,8 @@ class RunRecorder:
         self._csv_stages: list[str] | None = None  # columns of frames.csv
         self._flushed_s = self._saved_s = time.monotonic()
         self._savable = True
+        self._summed: dict[str, int] = {}  # rows of each table that the last checkpoint rests on
+        self._kept: dict[str, KeptRows] = {}  # what was replaced since, by the table's name
 
     # What goes in
 
@@ -202,9 +209,11 @@ class RunRecorder:
             return
         table = self._tables["estimates"]
         with self._writing():
-            for k, index in enumerate(table.rows()["index"].tolist()):
-                if index in estimates:
-                    table.replace(k, estimate_row(index, estimates[index]))
+            known = table.rows()["index"].tolist()
+            rows = [k for k, index in enumerate(known) if index in estimates]
+            self._keep_rows("estimates", rows)
+            for k in rows:
+                table.replace(k, estimate_row(known[k], estimates[known[k]]))
         self._written = 0
         self._saved_s = -np.inf  # the last checkpoint is that of other rows
 
@@ -219,7 +228,10 @@ class RunRecorder:
                 rows = np.array(estimates.rows())
                 held = (rows["index"] >= mark.since) & (rows["index"] < mark.before)
                 sigma_m = _may_be_off_m(rows, held, mark)
-                for k in np.flatnonzero(held).tolist():
+                marked_rows = np.flatnonzero(held).tolist()
+                self._keep_rows("estimates", marked_rows)
+                self._keep_rows("frames", marked_rows)
+                for k in marked_rows:
                     estimate = marked(estimate_of(rows[k]), mark, sigma_m[k])
                     estimates.replace(k, estimate_row(int(rows["index"][k]), estimate))
                     log_row = np.array(frames.rows(k, k + 1))
@@ -361,7 +373,24 @@ class RunRecorder:
         except NotSavableError as error:
             self._savable = False
             log.warning("this run cannot go on with --resume if it is interrupted: %s", error)
+        else:
+            self._summed = {name: summed for name, (_, (summed, _)) in tables.items()}
+            for kept in self._kept.values():
+                kept.forget()
         self._saved_s = time.monotonic()
+
+    def _keep_rows(self, name: str, indices: Sequence[int]) -> None:
+        """Keep those of a table's rows that the last checkpoint rests on and that are replaced."""
+        of_checkpoint = [k for k in indices if k < self._summed.get(name, 0)]
+        if not of_checkpoint:
+            return
+        if name not in self._kept:
+            self._kept[name] = self._kept_rows(name)
+        checkpoint = checkpoint_id(self._unfinished / CHECKPOINT)
+        self._kept[name].keep(self._tables[name], of_checkpoint, checkpoint)
+
+    def _kept_rows(self, name: str) -> KeptRows:
+        return KeptRows(self._unfinished / f"{name}_kept.npy", _TABLES[name])
 
     def restore(self, dataset: Dataset | None) -> Any:
         """Go on from the folder's checkpoint; return the state that `save` was given.
@@ -379,6 +408,10 @@ class RunRecorder:
         own = state["recorder"]
         self._rows.stages = list(own["stages"])
         paths = {name: self._unfinished / f"{name}.npy" for name in _TABLES}
+        checkpoint = checkpoint_id(self._unfinished / CHECKPOINT)
+        for name in ("estimates", "frames"):
+            self._kept_rows(name).take_back(paths[name], checkpoint)
+        self._summed = {name: summed for name, (_, (summed, _)) in own["tables"].items()}
         for name, dtype in _TABLES.items():
             check_table(paths[name], dtype, *own["tables"][name])
         for name, (keep, summed) in own["tables"].items():
