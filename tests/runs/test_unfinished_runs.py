@@ -311,8 +311,8 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
 # Processes that end
 
 PATCHED = (  # as is the picture in this process, see tests/conftest.py
-    "import sys, vio.runs.recorder as r, vio.runs.picture as p, vio.cli; r._FLUSH_S = 0.0; "
-    "r._CHECKPOINT_S = 0.1; "
+    "import sys, vio.runs.recorder as r, vio.runs.picture as p, vio.cli; r._TIMES = "
+    "r._TIMES._replace(flush_s=0.0, checkpoint_s=0.1); "
     "p.RunPicture.write = lambda picture, path: path.write_bytes(b'PNG'); "
     "sys.exit(vio.cli.main(sys.argv[1:]))"
 )
