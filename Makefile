@@ -23,8 +23,9 @@ PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check $(addpre
 # The demo compiles what it needs itself, while it renders; the extension module with all loops comes afterwards.
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
+	@echo "the command vio: . $(BIN)/activate"
 	@test -d vio/numerics/machine_code || { \
-		echo "compiling the other loops in the background, once: about 200 s of computing; until then each run loads 130 MiB more"; \
+		echo "compiling the other loops in the background, once: about 200 s of computing (ended by: pkill -f tools.prebuild); until then runs are slower and load 130 MiB more"; \
 		nice $(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 & }
 
 # Algebra, records, settings, filters, and runs on features; under a minute on two cores once the loops are compiled.
@@ -100,10 +101,11 @@ release: $(VENV)/.base
 	$(BIN)/python -m tools.release
 
 $(BIN)/python$(EXE):
+	@echo "making the environment $(VENV): some seconds"
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
-	@echo "installing about 30 packages (0.9 GB) into $(VENV): a minute or more"
+	@echo "installing about 30 packages (0.9 GB) into $(VENV): a minute or more, the last of it without a line"
 	$(PIP_INSTALL) -e . setuptools
 	@touch $@
 
@@ -113,7 +115,7 @@ $(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	@touch $@ $(VENV)/.base
 
 $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
-	@echo "installing about 100 packages (2 GB) into $(VENV): minutes"
+	@echo "installing about 100 packages (2 GB) into $(VENV): minutes, the last of them without a line"
 	$(PIP_INSTALL) -e '.[dev]'
 	@touch $@ $(VENV)/.docs $(VENV)/.base
 

@@ -143,9 +143,10 @@ def test_the_page_counts_by_kind(tmp_path: Path) -> None:
     rows = [row | {"kind": "object", "half": "work"} for row in (base, missed, soon)]
     rows += [base | {"kind": "night", "half": None, "said": ["wrong"]}]
     rows += [{"kind": "clean", "source": "a", "motion": None, "ate_m": 0.01, "ratio": 1.5}]
-    kinds, healthy, _ = tables(rows)
+    kinds, healthy = tables(rows)
     assert "| 3 | 1 | 1 | 0 | 1 | 1 | 0 | 67 % | 12, 12 | 2, 2 |" in kinds
-    assert "| night | 1 | 1 | 2, 2 | wrong |" in healthy
+    assert "1 of 1 are flagged (night)." in healthy
+    assert "| night | 1 | wrong |" in healthy
     assert "seeds 1" in page(rows, "abc")
 
 

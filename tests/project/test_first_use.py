@@ -120,7 +120,9 @@ def test_each_part_is_compiled_beside_and_waited_for(
     assert (frontend.part, filter_.part) == ("frontend", "filter")
     assert frontend.calls == ["terminated", "waited for"]
     assert filter_.calls == ["waited for", "terminated", "waited for"]
-    assert caplog.messages == ["compiling loops, once on this machine: about 60 s of computing"]
+    assert caplog.messages == [
+        "compiling loops, once for this installation: about 60 s of computing"
+    ]
 
 
 def test_nothing_is_started_where_the_loops_are_at_hand(

@@ -36,16 +36,12 @@ checks were written.
 Nothing may be said of these that is not said of the recording as it is.
 
 {healthy}
-
-## Recordings as they are
-
-{clean}
 """
 
 
 def page(rows: Sequence[Row], commit: str) -> str:
     """Return the page, Markdown."""
-    kinds, healthy, clean = tables(rows)
+    kinds, healthy = tables(rows)
     faults = [row for row in rows if row.get("half")]
     seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in rows if "seed" in row}))
     return _PAGE.format(
@@ -56,7 +52,6 @@ def page(rows: Sequence[Row], commit: str) -> str:
         summary=summary(faults),
         kinds=kinds,
         healthy=healthy,
-        clean=clean,
     )
 
 
@@ -110,12 +105,11 @@ def _far_silent(rows: Sequence[Row]) -> int:
     return sum("error" not in row and row["silent"] and row["ratio"] > _FAR for row in rows)
 
 
-def tables(rows: Sequence[Row]) -> tuple[str, str, str]:
-    """Return the tables of faults by kind, of healthy variants and of clean runs, Markdown."""
+def tables(rows: Sequence[Row]) -> tuple[str, str]:
+    """Return the tables of faults by kind and of healthy variants, Markdown."""
     faults = [row for row in rows if row.get("half")]
     healthy = [row for row in rows if "half" in row and row["half"] is None]
-    clean = {(row["source"], row["motion"]): row for row in rows if row["kind"] == "clean"}
-    return _kinds_table(faults), _healthy_table(healthy), _clean_table(list(clean.values()))
+    return _kinds_table(faults), _healthy_table(healthy)
 
 
 def _kinds_table(rows: Sequence[Row]) -> str:
@@ -160,26 +154,13 @@ def _spread(values: Sequence[float]) -> str:
 
 
 def _healthy_table(rows: Sequence[Row]) -> str:
-    lines = [
-        "| variant | draws | flagged | ATE over clean: median, worst | said |",
-        "|---" * 5 + "|",
-    ]
-    for name in dict.fromkeys(row["kind"] for row in rows):
-        own = [row for row in rows if row["kind"] == name]
-        flagged = [row for row in own if row.get("said") or "error" in row]
-        ates = _spread([row["ate_m"] / row["clean_ate_m"] for row in own if row.get("ate_m")])
-        said = "; ".join(
-            dict.fromkeys(line for row in flagged for line in row.get("said", [row.get("error")]))
-        )
-        lines.append(f"| {name} | {len(own)} | {len(flagged)} | {ates} | {said} |")
-    flags = sum(bool(row.get("said")) or "error" in row for row in rows)
-    return "\n".join([*lines, f"| all | {len(rows)} | {flags} | | |"])
-
-
-def _clean_table(rows: Sequence[Row]) -> str:
-    lines = ["| recording | motion | ATE mm | error over sigma, worst |", "|---" * 4 + "|"]
-    for row in rows:
-        if "error" not in row:
-            cells = (row["source"], row["motion"] or "images", f"{1e3 * row['ate_m']:.3g}")
-            lines.append(f"| {' | '.join(cells)} | {row['ratio']:.2g} |")
+    flagged = [row for row in rows if row.get("said") or "error" in row]
+    drawn = ", ".join(dict.fromkeys(row["kind"] for row in rows))
+    lines = [f"{len(flagged)} of {len(rows)} are flagged ({drawn})."]
+    if flagged:
+        lines += ["", "| variant | flagged | said |", "|---|---|---|"]
+    for name in dict.fromkeys(row["kind"] for row in flagged):
+        own = [row for row in flagged if row["kind"] == name]
+        said = dict.fromkeys(line for row in own for line in row.get("said", [row.get("error")]))
+        lines.append(f"| {name} | {len(own)} | {'; '.join(said)} |")
     return "\n".join(lines)

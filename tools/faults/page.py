@@ -87,7 +87,7 @@ def _run(row: Row) -> str:
 def _found(row: Row, usual: Mapping[str, Sequence[str]]) -> str:
     """The codes of a run that the recording as it is has not, or its error."""
     if "error" in row:
-        return str(row["error"])
+        return ": ".join(str(row["error"]).split(": ")[:2])
     known = usual.get(_run(row), ())
     return ", ".join(f"`{code}`" for code in row["codes"] if code not in known)
 

@@ -514,6 +514,8 @@ def free_folder(source: Path, root: Path = Path("runs")) -> Path:
     number = 1
     while (folder := root / (name if number == 1 else f"{name}-{number}")).exists():
         number += 1
+    if number > 1:
+        log.log(NOTE, "%s is there: results go to %s", root / name, folder)
     return folder
 
 

@@ -58,7 +58,9 @@ def compiled_beside(parts: tuple[Part, ...], motion: RunMotion) -> Iterator[None
         yield
         return
     log.log(
-        NOTE, "compiling loops, once on this machine: about %.0f s of computing", compiling.USUAL_S
+        NOTE,
+        "compiling loops, once for this installation: about %.0f s of computing",
+        compiling.USUAL_S,
     )
     helpers = {
         part: subprocess.Popen([sys.executable, "-m", __name__, part, motion]) for part in parts
