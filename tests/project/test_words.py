@@ -51,7 +51,7 @@ LIMITS = {
     "docs/neighbours.md": 1250,
     "docs/notes/consistency.md": 880,
     "docs/recordings.md": 1750,
-    "docs/results.md": 2900,
+    "docs/results.md": 2950,
     "docs/settings.md": 1550,
     "docs/simulation.md": 1040,
     "docs/tutorials/target.md": 1390,
