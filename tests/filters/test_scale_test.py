@@ -186,3 +186,11 @@ def test_what_the_sensors_noise_explains_is_no_doubt() -> None:
     for _ in range(40):
         test.end_frame()
     assert test.doubt() == 0.0
+
+
+def test_noise_passes_for_a_larger_scale_only() -> None:
+    test = measured(-0.6, 1 / 6)
+    before = test.doubt()
+    for _ in range(40):
+        test.end_frame()
+    assert test.doubt() == before > 0.05

@@ -124,8 +124,9 @@ class ScaleTest:
         measured = self._information - _SCALE.log_sigma**-2
         if measured <= 0.0:
             return 0.0
-        by_noise = _SCALE.information_by_noise * self._frames / measured
-        log = max(abs(self._vector) / measured - by_noise, 0.0)
+        # noise passes for a larger scale only
+        by_noise = _SCALE.information_by_noise * self._frames if self._vector > 0.0 else 0.0
+        log = max(abs(self._vector) - by_noise, 0.0) / measured
         variances = np.array([_USUAL_SIGMA, _SCALE.log_sigma]) ** 2 + 1.0 / measured
         squared = log**2 / variances
         likelihood = np.exp(-0.5 * (squared - squared[1]))  # over that of a wrong calibration
