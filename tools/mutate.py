@@ -155,7 +155,8 @@ def _larger(text: str) -> Iterator[tuple[str, str, str]]:
         larger = _half_more(number)
         if larger != number:
             indent = "\n" + " " * node.col_offset
-            yield target.id, f"{indent}{old}", f"{indent}{old.removesuffix(value)}{larger!r}"
+            before, _, after = old.rpartition(value)  # which may be in brackets
+            yield target.id, f"{indent}{old}", f"{indent}{before}{larger!r}{after}"
 
 
 def _half_more(number: Any) -> Any:

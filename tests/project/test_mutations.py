@@ -73,6 +73,10 @@ _ONE = 1  # at least one more
 _SHARE: float = 0.5
 _PAIR = (-4, 2.0)
 _GRID = ((1, 2), (3, 4))
+_LONG = (
+    # why
+    2.0
+)
 _ZERO = 0
 _NAME = "1"
 
@@ -97,6 +101,7 @@ _RULES = _Rules()
         ("\n_SHARE: float = 0.5", "\n_SHARE: float = 0.75"),
         ("\n_PAIR = (-4, 2.0)", "\n_PAIR = (-6, 3.0)"),
         ("\n_GRID = ((1, 2), (3, 4))", "\n_GRID = ((2, 3), (4, 6))"),
+        ("\n_LONG = (\n    # why\n    2.0\n)", "\n_LONG = (\n    # why\n    3.0\n)"),
         ("\n    share: float = 0.25", "\n    share: float = 0.375"),
     ]
     assert {m.tests for m in found} == {("tests/test_part.py",)}

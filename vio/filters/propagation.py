@@ -45,11 +45,9 @@ class _TiltRules(NamedTuple):
 
 
 _TILT = _TiltRules()
-_LINEAR_RAD = (
-    # standard deviation of a rotation beyond which the errors of poses before and after it are not
-    # linear
-    1.0
-)
+# standard deviation of a rotation beyond which the errors of poses before and after it are not
+# linear
+_LINEAR_RAD = 1.0
 
 
 @dataclass(frozen=True, slots=True)
