@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.findings import Finder, Finding
+from vio.numerics.robust import robust_sigma
 
 
 class _TurnRules(NamedTuple):
@@ -29,7 +30,6 @@ class _TurnRules(NamedTuple):
     jump_px: float = 0.5  # of all disparities since the frame before …
     # … and an angle: a drive whose calibration is off has 0.55 px, 0.044 degrees
     jump_rad: float = 0.07 * np.pi / 180.0
-    pixel_sigma_px: float = 0.3  # of one disparity, pixels
 
 
 _TURN = _TurnRules()
@@ -44,12 +44,12 @@ class _ShakeRules(NamedTuple):
     min_px: float = 0.12  # standard deviation of the common error …
     # … and of the angle: a drive whose calibration is off comes to 0.15 px, 0.012 degrees
     min_rad: float = 0.02 * np.pi / 180.0
+    pixel_sigma_px: float = 0.3  # of one disparity
 
 
 _SHAKE = _ShakeRules()
 _CODE = "right-camera-turned"
 _SHAKE_CODE = "right-camera-shakes"
-_MEDIAN_SIGMAS = 0.6745  # median size of a normal distribution, standard deviations
 
 
 class RightTurn(Finder):
@@ -141,7 +141,7 @@ class PairShake(Finder):
         sigma_px = self.sigma_px
         if sigma_px <= self._limit_px:
             return 1.0
-        return float(np.sqrt(1.0 + self._matched * (sigma_px / _TURN.pixel_sigma_px) ** 2))
+        return float(np.sqrt(1.0 + self._matched * (sigma_px / _SHAKE.pixel_sigma_px) ** 2))
 
     def frame(self, index: int, common_px: float | None, matched: int) -> None:
         """Take by how much the disparities of a frame's matches differ from those of the frame
@@ -187,4 +187,4 @@ class PairShake(Finder):
         """
         if len(self._common_px) < _SHAKE.min_frames:
             return 0.0
-        return float(np.median(np.abs(self._common_px))) / (_MEDIAN_SIGMAS * float(np.sqrt(2.0)))
+        return robust_sigma(self._common_px) / float(np.sqrt(2.0))

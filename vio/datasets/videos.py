@@ -21,6 +21,7 @@ import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.datasets.companions import ReadImages, find_calibration_of, read_companions
+from vio.datasets.frame_times import nearest
 from vio.datasets.image_pairs import ImageRecording, half_of
 from vio.datasets.image_times import times_of
 from vio.datasets.images import prefetch
@@ -217,10 +218,11 @@ def _uneven_times(
         for f in facts
     )
     usual_ns = float(np.median(np.diff(left_ns)))
-    nearest = np.searchsorted(right_ns[:-1] + np.diff(right_ns) // 2, left_ns)
-    paired = np.flatnonzero(np.abs(right_ns[nearest] - left_ns) <= _TIMES.paired * usual_ns)
-    rows = np.column_stack([paired, nearest[paired]])
-    rows = rows[np.unique(rows[:, 1], return_index=True)[1]]
+    partner = nearest(left_ns, right_ns)
+    mutual = nearest(right_ns, left_ns)[partner] == np.arange(len(left_ns))
+    near = np.abs(right_ns[partner] - left_ns) <= _TIMES.paired * usual_ns
+    paired = np.flatnonzero(mutual & near)
+    rows = np.column_stack([paired, partner[paired]])
     if not len(rows):
         raise DataError(
             f"{files[0]} and {files[1].name} have no two frames with one time; write one time a "

@@ -4,6 +4,7 @@ wrong.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,6 +90,14 @@ def scale_sigma(settings: MsckfSettings) -> float:
     return float(np.hypot(settings.stereo_baseline_sigma, settings.stereo_focal_sigma))
 
 
+@functools.lru_cache(maxsize=8)
+def _powers_over_width(camera: StereoCamera) -> FloatArray:
+    """Means over the width (4,) of what multiplies the columns' coefficients in the middle row."""
+    width = 2.0 * camera.cu if camera.width is None else camera.width
+    x = (np.linspace(0.0, width, _RIG.field_samples) - camera.cu) / camera.fu
+    return np.array([1.0, x.mean(), (x**2).mean(), (x**4).mean()])
+
+
 def field_doubt(
     camera: StereoCamera, settings: MsckfSettings, field: FloatArray, covariance: FloatArray
 ) -> float:
@@ -105,15 +114,12 @@ def field_doubt(
         field: (T,) coefficients of (R3), those of the columns first, focal lengths.
         covariance: (T, T) of them.
     """
-    usual = stereo_yaw_rad(settings)
-    if camera.projection != "pinhole":
+    if camera.projection != "pinhole" or settings.stereo_baseline_sigma == 0.0:
         return 0.0
-    width = 2.0 * camera.cu if camera.width is None else camera.width
-    x = (np.linspace(0.0, width, _RIG.field_samples) - camera.cu) / camera.fu
-    mean_D_field = np.array([1.0, x.mean(), (x**2).mean(), (x**4).mean()])
-    mean = float(mean_D_field @ field[:4])
-    noise = float(mean_D_field @ covariance[:4, :4] @ mean_D_field)
-    squared = (mean**2 - noise) / usual**2
+    means = _powers_over_width(camera)
+    mean = float(means @ field[:4])
+    noise = float(means @ covariance[:4, :4] @ means)
+    squared = (mean**2 - noise) / stereo_yaw_rad(settings) ** 2
     return scale_sigma(settings) * float(np.sqrt(max(squared - 1.0, 0.0)))
 
 

@@ -517,11 +517,9 @@ def rig_scale_sigma(result: RunResult) -> float | None:
     ):
         return None
     field = result.estimates[-1].stereo_field
-    doubt = (
-        0.0
-        if field is None or settings.stereo_baseline_sigma == 0.0
-        else field_doubt(camera, settings, field.coefficients, field.covariance)
-    )
+    doubt = 0.0
+    if field is not None:
+        doubt = field_doubt(camera, settings, field.coefficients, field.covariance)
     return float(np.hypot(scale_sigma(settings), doubt))
 
 
