@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
-from vio.filters.window_posterior import WindowPosterior
+from vio.filters.window_posterior import WindowPosterior, given
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_from_parts, se3_inverse
 
 _START = se3_exp([3.0, -2.0, 1.0, 0.4, -0.8, 1.1])
@@ -126,3 +126,15 @@ def test_without_imu_the_velocity_is_that_of_the_poses_around() -> None:
     np.testing.assert_allclose(
         velocities[[0, -1]], exact[[0, -1]] + [[0.3, 0, 0], [-0.3, 0, 0]], atol=1e-12
     )
+
+
+def test_what_is_left_of_a_covariance_where_errors_are_known() -> None:
+    half = np.random.default_rng(3).normal(0, 1, (9, 9))
+    P = half @ half.T
+    known = slice(4, 6)
+    others = np.delete(np.arange(9), [4, 5])
+    left = given(P, known)
+    by_information = np.linalg.inv(np.linalg.inv(P)[np.ix_(others, others)])
+    np.testing.assert_allclose(left[np.ix_(others, others)], by_information, atol=1e-9)
+    np.testing.assert_allclose(left[known], 0.0, atol=1e-9)
+    np.testing.assert_array_equal(given(P, slice(4, 4)), P)

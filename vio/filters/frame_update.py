@@ -40,7 +40,12 @@ from vio.filters.stereo_calibration import (
 from vio.filters.track_records import ErrorRows, Information, LandmarkResiduals, Views
 from vio.filters.tracks import precision, rows_of
 from vio.filters.window import Window
-from vio.filters.window_posterior import WindowPosterior, landmark_covariance, move_covariance
+from vio.filters.window_posterior import (
+    WindowPosterior,
+    given,
+    landmark_covariance,
+    move_covariance,
+)
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import (
     FloatArray,
@@ -609,6 +614,7 @@ class FrameUpdate:
         if considered is not None:
             V = V - P @ (A[:size, :size] @ V + considered[:size])
         reported = P + self._rig.reported_uncertainty(window, V)
+        reported += (self._overdispersion.outlasting - 1.0) * given(P, window.state.stereo)
         self._propagation.posterior = FramePosterior.of(window, P)
         self._propagation.reported = FramePosterior.of(window, reported)
         self.smoothed = WindowPosterior.of(window, P, reported)

@@ -54,6 +54,13 @@ class Overdispersion:
         # by how much too often the information of pixels is counted, at least one
         self.factor = PRIOR_FACTOR
 
+    @property
+    def outlasting(self) -> float:
+        """Factor on the reported variances of what pixels say: errors also outlast tracks and
+        clusters, which no score shows. One where they are white.
+        """
+        return min(self.factor, PRIOR_FACTOR)
+
     def add(
         self, ids: IntArray, directions: FloatArray, scores: FloatArray, information: FloatArray
     ) -> None:

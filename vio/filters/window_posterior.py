@@ -156,6 +156,17 @@ class WindowPosterior:
         return squared_distance(xi, C, 1e-18) < limit
 
 
+def given(P: FloatArray, rows: slice) -> FloatArray:
+    """Covariance (k, k) of errors of covariance P (k, k) where those of `rows` are known, which
+    have none there.
+    """
+    if rows.start == rows.stop:
+        return P
+    half = np.linalg.solve(np.linalg.cholesky(P[rows, rows]), P[rows])
+    out: FloatArray = P - half.T @ half
+    return out
+
+
 def scale_sigma(posterior: WindowPosterior) -> float | None:
     """Standard deviation of the scale of the motion over the window, over it; None where there is
     no motion.
