@@ -46,6 +46,7 @@ class Film:  # has `frame(result)` and `close()`, and so can watch any run
 dataset = open_dataset(sys.argv[1])
 film = Film()
 every = int(sys.argv[3]) if len(sys.argv) > 3 else 2
+print(f"running on {len(dataset.recording.frame_times_ns)} frames", flush=True)
 result = run(dataset, load_config(), viewer=film)
 score = evaluate(result.trajectory, dataset.recording.reference, T_cam0_imu=result.T_cam0_body)
 truth = score.reference.positions

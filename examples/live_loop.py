@@ -42,6 +42,7 @@ def controller(live):
 
 
 with vio.LiveOdometry(recording.camera, T_cam0_imu=recording.T_cam0_imu) as live:
+    print("warming up", flush=True)
     live.warm_up()  # compiles and loads: the first frame then takes no longer than others
     drivers = [camera_driver, imu_driver] if live.motion == "imu" else [camera_driver]
     threads = [threading.Thread(target=work, args=(live,)) for work in (controller, *drivers)]

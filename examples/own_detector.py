@@ -23,4 +23,5 @@ class FastCorners:
 
 
 if __name__ == "__main__":
+    print("checking on 40 rendered frames", flush=True)
     print(check_frontend(FastCorners))

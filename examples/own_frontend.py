@@ -63,14 +63,17 @@ def flow(first, second, points):
 
 
 if __name__ == "__main__":
+    print("checking on 40 rendered frames", flush=True)
     print(check_frontend(CornersAndFlow))
     with tempfile.TemporaryDirectory() as folder:
         if len(sys.argv) < 2:
+            print("rendering the street", flush=True)
             from vio.sim.scenarios import write_demo_recording
         source = (
             sys.argv[1] if len(sys.argv) > 1 else str(write_demo_recording(Path(folder) / "street"))
         )
         dataset = open_dataset(source)
+        print(f"running on {len(dataset.recording.frame_times_ns)} frames", flush=True)
         parts = Parts(frontend=CornersAndFlow(dataset.recording.camera))
         result = run(dataset, load_config(overrides=["motion=none"]), parts=parts)
         if dataset.recording.reference is not None:

@@ -13,6 +13,7 @@ from vio.runs.folder import write_run_folder
 
 config = vio.load_config()
 dataset = vio.open_dataset(sys.argv[1])
+print(f"running on {len(dataset.recording.frame_times_ns)} frames", flush=True)
 first = vio.run(dataset, config, keep_observations=True)
 
 with tempfile.TemporaryDirectory() as folder:

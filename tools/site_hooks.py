@@ -50,10 +50,25 @@ def _converted(found: re.Match[str]) -> str:
     display = found.group(1) == "div"
     latex = re.sub(r"^\\[(\[]|\\[)\]]$", "", unescape(found.group(2)).strip()).strip()
     number = re.search(r"\\tag\{(\w+)\}", latex)
-    math = convert(
-        re.sub(r"\\tag\{\w+\}", "", latex).strip(), display="block" if display else "inline"
-    )
+    latex = re.sub(r"\\tag\{\w+\}", "", latex).strip()
     if not display:
-        return str(math)
+        return str(convert(latex, display="inline"))
+    math = "".join(convert(part, display="block") for part in _apart(latex))
     tag = "" if number is None else f'<span id="{number[1].lower()}">({number[1]})</span>'
-    return f'<div class="equation">{math}{tag}</div>'
+    return f'<div class="equation"><div class="formulas">{math}</div>{tag}</div>'
+
+
+def _apart(latex: str) -> list[str]:
+    r"""Return the formulas that `\quad` and `\qquad` put side by side, so that each may have a line
+    of its own where the page is narrow; those inside of brackets and environments stay.
+    """
+    parts = [""]
+    depth = 0
+    for token in re.split(r"(\\q?quad\b|\\begin\b|\\end\b|\\left\b|\\right\b|\\[{}]|[{}])", latex):
+        if token in (r"\quad", r"\qquad") and depth == 0:
+            parts.append("")
+            continue
+        depth += token in ("{", r"\begin", r"\left")
+        depth -= token in ("}", r"\end", r"\right")
+        parts[-1] += token
+    return [part.strip() for part in parts if part.strip()]

@@ -21,7 +21,7 @@ from tests.commands import json_of, refused
 from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_kitti, make_npz
 from vio.cli import build_parser, main
 from vio.config import BASIC, Config, describe
-from vio.errors import DataError
+from vio.errors import NOTE, DataError
 from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import se3_inverse
 
@@ -461,6 +461,8 @@ def test_a_report_is_written_and_opened_with_the_run(
     argv = ["run", str(recording), "--out", str(tmp_path / "a"), "--no-plot"]
     assert main([*argv, "--report", "--open"]) == 0
     assert opened == [(tmp_path / "a" / "report.html").resolve().as_uri()]
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.split() == ["report", str(tmp_path / "a" / "report.html")]
     page = (tmp_path / "a" / "report.html").read_text(encoding="utf-8")
     assert f"vio run {recording} --out {tmp_path / 'a'} --no-plot --report --open" in page
     assert "--open shows the page of --report" in refused(capsys, *argv, "--open")
@@ -519,6 +521,34 @@ def test_an_unknown_option_shows_the_usage_of_its_command(
     message = capsys.readouterr().err
     assert message.startswith("usage: vio eval")
     assert "unrecognized arguments: --alignment" in message
+
+
+@pytest.mark.parametrize(
+    ("argv", "hint"),
+    [
+        (["inspct", "x"], "there is no command 'inspct'; did you mean inspect?"),
+        (["zzz"], "there is no command 'zzz'; vio --help lists them"),
+        (["run", "x", "--refrence", "y"], "arguments: --refrence y; did you mean --reference?"),
+        (["run", "x", "--frontnd=orb"], "arguments: --frontnd=orb; did you mean --frontend?"),
+    ],
+)
+def test_a_misspelt_command_or_option_gets_the_nearest_one(
+    argv: list[str], hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(argv)
+    assert ended.value.code == 2
+    assert hint in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_where_there_is_no_browser_the_page_to_open_is_named(
+    finished: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("webbrowser.open", lambda uri: False)
+    with caplog.at_level(NOTE):
+        assert main(["report", finished, "--open"]) == 0
+    page = (Path(finished) / "report.html").resolve()
+    assert f"no browser was found here; open {page} in one" in caplog.messages
 
 
 def test_a_run_is_compared_with_the_truth_of_its_recording(

@@ -251,6 +251,7 @@ def test_a_path_with_a_colon_is_a_path_when_it_exists(
         ("empty", "empty is empty; give a ROS bag .*, a KITTI folder"),
         ("other", "other: no known recording; looked for a ROS bag .*, a KITTI folder"),
         ("root", re.escape("root holds several KITTI sequences")),
+        ("several", r"several: is no recording, but holds a\.npz \(ece276a\), b\.npz "),
         ("text.txt", "text.txt: no known recording; looked for"),
         ("half.npz", "half.npz: is damaged"),
         ("log:text.txt", "text.txt: is damaged or no .npz archive"),
@@ -265,6 +266,9 @@ def test_rejects_unknown_sources_with_one_line_error(
     for name in ("text.txt", "film.mp4", "holiday/IMG_1.JPG", "half/right/0.png", "half/calib.txt"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("hello\n")
+    (tmp_path / "several").mkdir()
+    for name in ("a.npz", "b.npz"):
+        make_npz(tmp_path / "several" / name, ece276a_arrays(make_drive(6)))
     (tmp_path / "half.npz").write_bytes(make_source("ece276a", tmp_path).read_bytes()[:2000])
     with pytest.raises(DataError, match=message) as caught:
         open_dataset(source)

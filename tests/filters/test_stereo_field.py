@@ -20,11 +20,13 @@ from tests.commands import refused
 from tests.euroc_maker import EQUIDISTANT_RIG, RADTAN_RIG
 from tests.filters import test_filter_truth
 from tests.filters.test_filter_truth import Course
+from vio.calibration.severity import StereoError
 from vio.calibration.stereo_field import (
     PARAMETERS,
     DisplacementField,
     _Frame,
     calibrated_rig,
+    disparity_off,
     estimated_rig,
     field_of,
     rig_off_by,
@@ -421,6 +423,17 @@ def test_results_are_written_where_no_rig_has_the_field_that_was_found(
     assert metrics["stereo_field"]["rows_rms_px"] > 0.2
     assert metrics["stereo_field"]["rig"] is None
     assert not (out / "camchain-imucam.yaml").exists()
+
+
+def test_a_run_on_a_calibration_that_another_run_saved_has_nothing_beyond_doubt() -> None:
+    """A saved rig holds a field to what its fit allows: 0.07 px at this focal length, which the
+    filter's own standard deviation, of 0.01 px, does not know.
+    """
+    found = StereoFieldEstimate(np.array([-1e-4, *[0.0] * 7]), 1e-10 * np.eye(8))
+    off, sigma = disparity_off(found)
+    error = StereoError(0.03, 14.0, 707 * off, 707 * sigma)
+    assert error.disparity_px == pytest.approx(0.07, abs=0.01)
+    assert error.grade == "negligible"
 
 
 def test_pixel_field_of_an_estimate_without_rows_has_none() -> None:

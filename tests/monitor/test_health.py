@@ -88,6 +88,7 @@ def test_what_a_run_corrects_of_the_calibration_is_no_warning() -> None:
         field = StereoFieldEstimate(np.zeros(8), np.eye(8), rows_px)
         (finding,) = RunHealth().frame(0, GOOD, _estimate(0, stereo_field=field))
         assert is_corrected(finding) == corrected
+        assert ("px (rms)" in finding.message) != corrected  # the end of the run states the size
 
 
 def test_a_restart_is_one_event_and_its_jump_is_not_reported_as_a_speed() -> None:

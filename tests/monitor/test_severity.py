@@ -14,29 +14,29 @@ from vio.calibration.severity import Grade, StereoError, length_grade, rows_grad
         (
             StereoError(0.41, 16.4),
             "worth calibrating",
-            "; disparities off by as much would cost 2.5 m per 100 m",
+            "worth calibrating: rows off by 0.41 px (rms)",
         ),
         (
             StereoError(0.05, 20.0, -0.02, 0.01),
             "negligible",
-            "disparities by -0.02 ± 0.01 px, which costs 0.1 ± 0.05 m",
+            "disparities by -0.02 ± 0.01 px, and so lengths by 0.100 ± 0.050 %",
         ),
         (
             StereoError(0.05, 20.0, -0.08, 0.03),
             "negligible",
-            "by -0.08 ± 0.03 px, which costs 0.4 ± 0.15 m",
+            "by -0.08 ± 0.03 px, and so lengths by 0.40 ± 0.15 %",
         ),
         (
             StereoError(0.05, 20.0, 0.5, 0.01),
             "worth calibrating",
-            "by +0.50 ± 0.01 px, which costs 2.5 ± 0.05 m per 100 m",
+            "by +0.50 ± 0.01 px, and so lengths by 2.500 ± 0.050 %",
         ),
         (
             StereoError(0.05, 20.0, 3.0),
             "unusable",
-            "disparities by +3.00 px, which costs 15 m per 100 m",
+            "disparities by +3.00 px, and so lengths by 15 %",
         ),
-        (StereoError(0.05, 2.0, 3.84, 0.68), "unusable", "which costs 190 ± 34 m per 100 m"),
+        (StereoError(0.05, 2.0, 3.84, 0.68), "unusable", "lengths by 192 ± 34 %"),
         (
             StereoError(4.0, 20.0, 0.0, 0.01),
             "unusable",

@@ -23,12 +23,13 @@ from tests.dataset_makers import FRAME_S, make_kitti
 from tests.frontend.test_frontend_scene import CAMERA
 from tests.guard.test_guard import shifted
 from vio.cli import main
+from vio.datasets import open_dataset
 from vio.frontend import build_frontend
 from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.geometry.lie import so3_exp
 from vio.guard.guarded import guarded
 from vio.inspection.inertial import allan_deviation, noise_part, rest_part
-from vio.inspection.inspect import _tracking_parts, clock_facts
+from vio.inspection.inspect import _track, _tracking_parts, clock_facts, inspect_recording
 from vio.records import ImuDensities, ImuRecord
 
 
@@ -115,6 +116,34 @@ def test_a_turned_right_camera_is_named_before_and_in_the_run(
     )
     named = [line for line in caplog.messages if "the stereo calibration is off" in line]
     assert len(named) == 1
+
+
+def test_inspection_and_run_state_one_figure_of_a_calibration_that_is_off(
+    flight: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    folder = tmp_path / "turned"
+    shutil.copytree(flight, folder)
+    _turn_right_camera(folder, [0.2, 0.0, 0.1])
+    dataset = open_dataset(folder)
+    report = inspect_recording(
+        dataset,
+        lambda d: guarded(
+            build_frontend("auto", d.recording.camera, FrontendSettings(), d), d.recording.camera
+        ),
+        pairs=3,
+        tracked=12,
+    )
+    before = next(part for part in report.parts if part.name == "calibration")
+    ran = tmp_path / "ran"
+    command = ["run", str(folder), "--motion", "none", "--stop", "12", "--out", str(ran), "--quiet"]
+    assert main(command) == 0
+    after = json.loads((ran / "metrics.json").read_text())["stereo_field"]
+    assert before.facts["rows_rms_px"] > 0.3
+    assert before.facts["rows_rms_px"] == pytest.approx(after["rows_rms_px"], rel=0.03)
+    named = [line for line in caplog.messages if "the stereo calibration is off" in line]
+    assert len(named) == 1
+    assert " px" not in named[0]  # the size is stated once, at the end
 
 
 def test_one_screen_for_people(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -231,12 +260,13 @@ def test_pairs_of_different_times_are_named(delay: int, named: str | None) -> No
     recording = SimpleNamespace(camera=CAMERA, motion=(), T_cam0_imu=None)
     dataset: Any = SimpleNamespace(recording=recording, events=lambda *span: iter(pairs))
     settings = FrontendSettings(grid=GridSettings(target_features=60))
-    parts = _tracking_parts(
+    seen = _track(
         dataset,
-        lambda d: guarded(build_frontend("klt", CAMERA, settings), CAMERA),
+        guarded(build_frontend("klt", CAMERA, settings), CAMERA),
         range(len(pairs)),
         lambda done, total: None,
     )
+    parts = _tracking_parts(dataset.recording, seen)
     faults = [fault for part in parts if part.name == "pairs" for fault in part.faults]
     assert len(faults) == (named is not None)
     assert named is None or faults[0].startswith(named)

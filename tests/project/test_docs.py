@@ -25,6 +25,7 @@ import yaml
 import vio.sim.scenarios
 from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_npz
 from tools.bad_inputs import PAGE
+from tools.site_hooks import _apart
 from vio.cli import build_parser, main
 from vio.cli.arguments import config_from
 from vio.cli.render import scenario_from
@@ -585,3 +586,10 @@ def _anchors(file: Path) -> set[str]:
     headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     formed = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
     return formed | set(re.findall(r'<a id="([\w-]+)"></a>', text))
+
+
+def test_formulas_side_by_side_may_be_put_below_one_another() -> None:
+    latex = r"a = \left[b \quad c\right], \qquad d = \text{e \quad f} \quad g"
+    assert _apart(latex) == [r"a = \left[b \quad c\right],", r"d = \text{e \quad f}", "g"]
+    matrix = r"\begin{pmatrix} 1 \quad 2 \end{pmatrix} \rightarrow \{x\}"
+    assert _apart(matrix) == [matrix]

@@ -4,10 +4,12 @@ and a signal ends a run that compiles.
 
 from __future__ import annotations
 
+import io
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,9 +18,10 @@ import pytest
 
 import vio.filters.track_loops
 import vio.frontend.align
-from vio.cli import output
+from vio.cli import waiting
 from vio.cli.output import ProgressBar
 from vio.cli.stopping import StopRequest
+from vio.cli.waiting import SilenceBroken, line_due, stage
 from vio.errors import NOTE
 from vio.live import first_use
 from vio.live.first_use import Part, compile_part, compiled_beside
@@ -30,7 +33,7 @@ from vio.records import RunMotion
 def test_work_without_a_terminal_says_that_it_begins_and_how_far_it_is(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(output, "_LINE_S", 0.0)
+    monkeypatch.setattr(waiting, "_LINES", waiting._LineRules(0.0, 0.0))
     with caplog.at_level(NOTE), ProgressBar("running x", 3, unit="frames", announced=True) as bar:
         bar.advance()
         bar.advance()
@@ -68,7 +71,7 @@ def test_compiling_is_counted_and_said_every_few_seconds(
         assert loop(1.5) == 3.0
         assert loop(2.5) == 5.0
     assert (progress.compiled, progress.is_compiling) == (1, False)
-    assert caplog.messages == ["compiling loops, once: 1 of about 110"]
+    assert caplog.messages == ["compiling loops, once: 1 of about 170"]
 
 
 def test_a_signal_ends_a_run_that_compiles_at_once() -> None:
@@ -85,9 +88,10 @@ class _Helper:
 
     made: ClassVar[list[_Helper]] = []
 
-    def __init__(self, command: list[str]) -> None:
+    def __init__(self, command: list[str], stdout: int) -> None:
         self.part = command[-2]
         self.calls: list[str] = []
+        self.stdout = io.BytesIO(b"...")
         self.made.append(self)
 
     def wait(self) -> None:
@@ -173,4 +177,49 @@ def test_a_process_compiles_a_part(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "vio.live.first_use", "filter", "none"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "WARNING" not in done.stderr
+    assert not done.stderr
+    assert set(done.stdout) <= {"."}
+
+
+def test_one_count_is_of_all_processes_that_compile(
+    helpers: list[_Helper], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    progress = compiling.Progress()
+    monkeypatch.setattr(compiling, "PROGRESS", progress)
+    monkeypatch.setattr(compiling, "_LINE_S", 0.0)
+    with caplog.at_level(NOTE), compiled_beside(("frontend", "filter"), "imu"):
+        assert _becomes_true(lambda: progress.compiled == 6)
+    counts = [int(line.split()[3]) for line in caplog.messages if ", once: " in line]
+    assert sorted(counts) == [1, 2, 3, 4, 5, 6]
+    progress.compiled = compiling.USUAL_LOOPS + 1
+    assert progress.line() == f"compiling loops, once: {compiling.USUAL_LOOPS + 1}"
+
+
+def _becomes_true(condition: Callable[[], bool]) -> bool:
+    end_s = time.monotonic() + 20.0
+    while not condition() and time.monotonic() < end_s:
+        time.sleep(0.01)
+    return condition()
+
+
+def test_a_silent_wait_gets_a_line_that_says_what_goes_on(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(waiting, "_LINES", waiting._LineRules(0.05, 0.0))
+    with caplog.at_level(NOTE), SilenceBroken("vio run"):
+        assert _becomes_true(lambda: any(m.startswith("vio run: ") for m in caplog.messages))
+        with ProgressBar("running x", 3, unit="frames"):
+            assert _becomes_true(lambda: "running x: 0 of 3 frames" in caplog.messages)
+            with stage("drawing"):
+                assert _becomes_true(lambda: any("drawing: " in m for m in caplog.messages))
+    said = len(caplog.messages)
+    time.sleep(0.2)
+    assert len(caplog.messages) == said  # it ends with the block
+
+
+def test_lines_become_rarer_where_the_work_takes_long() -> None:
+    assert not line_due(4.0, 4.0)
+    assert line_due(6.0, 6.0)
+    assert not line_due(60.0, 20.0)
+    assert line_due(60.0, 30.0)
+    assert line_due(10_000.0, 60.0)

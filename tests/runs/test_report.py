@@ -75,7 +75,7 @@ def test_the_words_and_the_table_hold_the_figures_of_the_run(runs: tuple[Path, P
     assert f"{1e3 * 0.05:.1f} ms" in text  # one frame every 50 ms
     figures = run_figures(run)
     assert figures["ATE"] == f"{1e3 * run.metrics['ate_m']:.3g} mm"
-    assert figures["path (m)"] == f"{run.metrics['path_length_m']:.2f}"
+    assert figures["path"] == f"{run.metrics['path_length_m']:.2f} m of imu"
     assert figures["ms a frame, median"] == f"{run.metrics['ms_per_frame_median']:.1f}"
     assert figures["observations refused (%)"] == f"{100 * run.metrics['refused_share']:.1f}"
 

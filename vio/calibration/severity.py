@@ -8,6 +8,7 @@ axis shows in disparities alone); motion does.
 
 from __future__ import annotations
 
+import math
 from typing import Literal, TypeAlias, get_args
 
 from vio.dataclass import dataclass
@@ -23,7 +24,7 @@ class _SeverityRules:
     # along rows fails.
     negligible_rows_px: float = 0.15
     unusable_rows_px: float = 2.0
-    # Lengths, m per 100 m. Less than the first is below the drift of images alone on a road; a tenth is
+    # Lengths, per cent. Less than the first is below the drift of images alone on a road; a tenth is
     # no measurement.
     negligible_length: float = 0.2
     unusable_length: float = 10.0
@@ -44,8 +45,8 @@ class StereoError:
     disparity_sigma_px: float | None = None
 
     @property
-    def per_100_m(self) -> float | None:
-        """Metres by which 100 m come out wrong if nothing corrects it; None: not known."""
+    def length_percent(self) -> float | None:
+        """By what share lengths come out wrong if nothing corrects it, %; None: not known."""
         if self.disparity_px is None or self.seen_px <= 0:
             return None
         return 100 * abs(self.disparity_px) / self.seen_px
@@ -65,17 +66,17 @@ class StereoError:
         text = f"{self.grade}: rows off by {self.rows_px:.2f} px (rms)"
         if self.seen_px < 0:
             return f"{text}, most disparities are negative"
-        if self.disparity_px is not None and self.per_100_m is not None:
-            sigma_px = ""
-            sigma_m = ""
-            if self.disparity_sigma_px is not None:
-                sigma_px = f" ± {self.disparity_sigma_px:.2f}"
-                sigma_m = f" ± {_short(100 * self.disparity_sigma_px / self.seen_px)}"
-            cost = f"which costs {_short(self.per_100_m)}{sigma_m} m per 100 m"
-            return f"{text}, disparities by {self.disparity_px:+.2f}{sigma_px} px, {cost}"
-        if self.grade == "negligible" or self.seen_px <= 0:
+        if self.disparity_px is None or self.length_percent is None:
             return text
-        return f"{text}; disparities off by as much would cost {_short(100 * self.rows_px / self.seen_px)} m per 100 m"
+        sigma_px = ""
+        percent = _short(self.length_percent)
+        if self.disparity_sigma_px is not None:
+            sigma_px = f" ± {self.disparity_sigma_px:.2f}"
+            sigma_percent = 100 * self.disparity_sigma_px / self.seen_px
+            decimals = max(1 - math.floor(math.log10(max(sigma_percent, 1e-3))), 0)
+            percent = f"{self.length_percent:.{decimals}f} ± {sigma_percent:.{decimals}f}"
+        disparities = f"disparities by {self.disparity_px:+.2f}{sigma_px} px"
+        return f"{text}, {disparities}, and so lengths by {percent} %"
 
 
 def rows_grade(rows_px: float) -> Grade:
@@ -83,9 +84,9 @@ def rows_grade(rows_px: float) -> Grade:
     return _graded(rows_px, _RULES.negligible_rows_px, _RULES.unusable_rows_px)
 
 
-def length_grade(per_100_m: float) -> Grade:
-    """Grade metres by which 100 m come out wrong."""
-    return _graded(per_100_m, _RULES.negligible_length, _RULES.unusable_length)
+def length_grade(percent: float) -> Grade:
+    """Grade the share by which lengths come out wrong, %."""
+    return _graded(percent, _RULES.negligible_length, _RULES.unusable_length)
 
 
 def _graded(size: float, negligible: float, unusable: float) -> Grade:

@@ -111,6 +111,17 @@ _TEXT = {
 }
 
 
+def disparity_off(field: StereoFieldEstimate) -> tuple[float, float]:
+    """Return by which disparities are too large in the middle of the image, and its standard
+    deviation, focal lengths.
+
+    Terms beyond those of the field count in it as they do for a rig of that field: a run on the
+    calibration that another run saved may find as much.
+    """
+    variance = float(field.covariance[0, 0]) + _FIELD.model_sigma**2
+    return -float(field.coefficients[0]), math.sqrt(variance)
+
+
 @dataclass(frozen=True, slots=True)
 class DisplacementField:
     """How far the pixels of a rectified pair are off, as a run estimated it."""

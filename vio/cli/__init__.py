@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import gc
 import io
 import logging
@@ -21,10 +22,12 @@ import signal
 import sys
 import threading
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from importlib import import_module
 from types import FrameType, ModuleType
 
 from vio._version import __version__
+from vio.cli.waiting import SilenceBroken
 from vio.errors import NOTE, StoppedError, VioError
 from vio.files.printable import printable
 
@@ -57,6 +60,7 @@ _GC_OBJECTS = 100_000
 # bytes; a short run of MH_01 takes 976 MB, and OpenCV fails to load in 820
 _MIN_ADDRESS_SPACE = 1_000_000_000
 _LIGHT = ("config", "completion")  # commands that load no library
+_SEE_HELP = "; vio --help lists them"
 _MAX_SHOWN = 200  # characters of a path in a message
 _ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
@@ -130,14 +134,24 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     words = sys.argv[1:] if argv is None else list(argv)
     command = next((word for word in words if not word.startswith("-")), None)
     parser = build_parser([command]) if command in COMMANDS else build_parser()
+    if command is not None and command not in COMMANDS:
+        parser.error(f"there is no command {command!r}{_near(command, COMMANDS) or _SEE_HELP}")
     args, unknown = parser.parse_known_args(words)
     if unknown:
         chosen = next(
             a for a in parser._actions if isinstance(a, argparse._SubParsersAction)
         ).choices[args.command]
-        chosen.error(f"unrecognized arguments: {' '.join(unknown)}")
+        first = unknown[0].partition("=")[0]
+        hint = _near(first, chosen._option_string_actions) if first.startswith("-") else ""
+        chosen.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     args.command_line = shlex.join(["vio", *words])
     return args
+
+
+def _near(word: str, known: Iterable[str]) -> str:
+    """Return a hint at the known word that is most like another one; nothing where none is."""
+    near = difflib.get_close_matches(word, list(known), 1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _check_address_space(command: str) -> None:
@@ -176,7 +190,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for library in ("matplotlib", "numba"):  # thousands of lines at the level of --debug
         logging.getLogger(library).setLevel(logging.WARNING)
     try:
-        with _orderly_end():
+        shown = argv is None and not getattr(args, "quiet", False)  # no caller from Python
+        with _orderly_end(), SilenceBroken(f"vio {args.command}") if shown else nullcontext():
             _check_address_space(args.command)
             status: int = args.execute(args)
             sys.stdout.flush()

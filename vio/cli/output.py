@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import sys
 import time
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from vio.cli.waiting import line_due, working
 from vio.errors import NOTE
 from vio.files.printable import json_text, printable
 
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 log = logging.getLogger(__name__)
-
-_LINE_S = 15.0  # between two lines of progress where there is no terminal
 
 
 def print_result(
@@ -49,7 +47,7 @@ def _shown(label: str, total: int | None, unit: str) -> tqdm[NoReturn]:
 class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
     """A tqdm bar on stderr for work whose total may become known only during it.
 
-    Where stderr is no terminal, a line now and then says how far the work is, and where it is
+    Where stderr is no terminal, a line every few seconds says how far the work is, and where it is
     `announced`, one that it begins; short work is silent otherwise.
     """
 
@@ -66,7 +64,9 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
         self._unit = unit
         self._done = 0
         self._total = total
-        self._next_line_s = time.monotonic() + _LINE_S if hidden else math.inf
+        self._begun_s = self._said_s = time.monotonic()
+        self._work = contextlib.ExitStack()
+        self._work.enter_context(working(self._line))
         if hidden and announced:
             log.log(NOTE, "%s%s", label, "" if total is None else f": {total} {unit}")
         self._bar = None if hidden else _shown(label, total, unit)
@@ -88,14 +88,20 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
     def _advance_to(self, done: int) -> None:
         self._done = done
         now_s = time.monotonic()
-        if now_s < self._next_line_s:
-            return
-        self._next_line_s = now_s + _LINE_S
+        if self._bar is None and line_due(now_s - self._begun_s, now_s - self._said_s):
+            self._said_s = now_s
+            log.log(NOTE, "%s", self._line())
+
+    def _line(self) -> str | None:
+        """Return how far the work is; None: the bar shows it."""
+        if self._bar is not None:
+            return None
         of = "" if self._total is None else f" of {self._total}"
-        log.log(NOTE, "%s: %d%s %s", self._label, done, of, self._unit)
+        return f"{self._label}: {self._done}{of} {self._unit}"
 
     def close(self) -> None:
         """Keep the bar as it is, and move the cursor below it."""
+        self._work.close()
         if self._bar is not None:
             self._bar.close()
 

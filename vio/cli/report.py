@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from vio.cli.arguments import examples
-from vio.errors import DataError
+from vio.cli.waiting import stage
+from vio.errors import NOTE, DataError
+
+log = logging.getLogger(__name__)
 
 
 def add_parser(commands: Any) -> None:
@@ -63,9 +67,11 @@ def write(
     runs = with_distinct_names([read_finished_run(folder, reference) for folder in folders])
     out = out or folders[0] / RunFile.REPORT
     check_new_file(out, b'<p class="remark">stereo-vio')
-    write_report(out, runs)
+    with stage("writing the report"):
+        write_report(out, runs)
     if shown:
         import webbrowser
 
-        webbrowser.open(out.resolve().as_uri())
+        if not webbrowser.open(out.resolve().as_uri()):
+            log.log(NOTE, "no browser was found here; open %s in one", out.resolve())
     return out

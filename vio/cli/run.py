@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +16,12 @@ from vio.cli.arguments import (
     examples,
 )
 from vio.cli.output import print_result
-from vio.errors import ConfigError
+from vio.errors import NOTE, ConfigError
 
 if TYPE_CHECKING:
     from vio.cli.running import Shown
+
+log = logging.getLogger(__name__)
 
 
 def add_parser(commands: Any) -> None:
@@ -101,7 +104,8 @@ def execute(args: argparse.Namespace) -> int:
     _check_combinations(args)
 
     def finished(metrics: dict[str, Any]) -> None:
-        print_result(metrics, metric_rows(metrics, plot=not args.no_plot), as_json=args.json)
+        rows = metric_rows(metrics, plot=not args.no_plot, reported=args.report)
+        print_result(metrics, rows, as_json=args.json)
         sys.stdout.flush()
 
     shown = Shown(not args.quiet, args.view, finished)
@@ -111,7 +115,7 @@ def execute(args: argparse.Namespace) -> int:
         args.frontend = None
     if args.resume is not None:
         _resume(args, own, shown)
-        return _reported(args.resume, shown=args.open) if args.report else 0
+        return _reported(args.resume, args) if args.report else 0
     options = RunOptions(
         out=args.out,
         reference=args.reference,
@@ -127,7 +131,7 @@ def execute(args: argparse.Namespace) -> int:
         command=args.command_line,
     )
     metrics = process(args.source, config_from(args), options, shown)
-    return _reported(Path(metrics["out"]), shown=args.open) if args.report else 0
+    return _reported(Path(metrics["out"]), args) if args.report else 0
 
 
 def _check_combinations(args: argparse.Namespace) -> None:
@@ -159,9 +163,13 @@ def _resume(args: argparse.Namespace, frontend: str | None, shown: Shown) -> Non
     )
 
 
-def _reported(folder: Path, *, shown: bool) -> int:
-    """Write the page about a run, and show it in a browser."""
+def _reported(folder: Path, args: argparse.Namespace) -> int:
+    """Write the page about a run, say where it is, and show it in a browser."""
     from vio.cli.report import write
 
-    write([folder], shown=shown)
+    page = write([folder], shown=args.open)
+    if args.json:  # of which stdout holds one object
+        log.log(NOTE, "report: %s", page)
+    else:
+        print_result({}, [("report", str(page))], as_json=False)
     return 0

@@ -525,9 +525,15 @@ def _integrity_text(integrity: dict[str, int]) -> str:
     return f"{counts}; see the findings above, and the column `integrity` of frames.csv"
 
 
-def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str, str]]:
-    """Return a run's metrics as a few table rows, ended by what to do next; `plot`: whether its
-    picture is drawn.
+def metric_rows(
+    metrics: dict[str, Any], *, plot: bool = True, reported: bool = False
+) -> list[tuple[str, str]]:
+    """Return a run's metrics as a few table rows, ended by what to do next.
+
+    Args:
+        metrics: of the run.
+        plot: whether its picture is drawn.
+        reported: whether a page about it is written anyway.
     """
     stages = ", ".join(f"{name} {ms:.1f}" for name, ms in metrics["stages_ms"].items())
     frames = metrics["frames"]
@@ -537,8 +543,7 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
     rows = [
         (
             "frames",
-            f"{frames}{f' of {span}' if span > frames else ''}, path "
-            f"{metrics['path_length_m']:.2f} m",
+            f"{frames}{f' of {span}' if span > frames else ''}, path {_path_text(metrics)}",
         ),
         ("time", f"{median:.1f} ms a frame, 95 % within {most:.1f} ({stages})"),
     ]
@@ -562,8 +567,21 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
     rows.append(("results", metrics["out"]))
     if plot:
         rows.append(("plot", str(Path(metrics["out"]) / RunFile.PICTURE)))
-    rows.append(("next", f"vio report {shlex.quote(metrics['out'])} --open"))
+    if not reported:
+        rows.append(("next", f"vio report {shlex.quote(metrics['out'])} --open"))
     return rows
+
+
+def _path_text(metrics: dict[str, Any]) -> str:
+    """Return the length of the estimated path, and of the path that is compared with ground truth:
+    in a bend, camera and IMU go different lengths.
+    """
+    own = f"{metrics['path_length_m']:.2f} m"
+    scores = metrics.get("evaluation")
+    if not scores or scores["body"] == metrics["body"]:
+        return own
+    compared = f"{scores['path_length_m']:.2f} m of {scores['body']}"
+    return f"{own} of {metrics['body']}, {compared} (as ground truth)"
 
 
 def _refused_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:

@@ -32,6 +32,9 @@ MODULES = [
     "ece276a",
     "utias",
 ]
+_FILES = (".npz", ".mat", ".bag", ".db3", ".mcap")  # recordings that are one file
+_MAX_LOOKED_AT = 200  # of what a folder holds that is no recording itself
+_MAX_NAMED = 3  # of the recordings in it
 
 
 def readers() -> dict[str, Reader]:
@@ -222,10 +225,50 @@ def _folder_kind(path: Path) -> str | None:
 
 
 def _kind_of_folder(path: Path) -> str | None:
-    """Return the kind of the first reader that recognises a folder, else of one that may read it."""
-    sure = (reader.kind for reader in _readers() if reader.is_folder(path))
-    possible = (reader.kind for reader in _readers() if reader.may_be_folder(path))
-    return next(sure, None) or next(possible, None)
+    """Return the kind of the first reader that recognises a folder, else of one that may read it.
+
+    Raises:
+        DataError: it is no recording, but holds some.
+    """
+    sure = next((reader.kind for reader in _readers() if reader.is_folder(path)), None)
+    if sure is not None:
+        return sure
+    inside = _recordings_in(path)
+    possible = next((reader.kind for reader in _readers() if reader.may_be_folder(path)), None)
+    if possible is not None:  # files beside images are what a run or a tracker wrote
+        inside = {name: kind for name, kind in inside.items() if (path / name).is_dir()}
+    if not inside:
+        return possible
+    first = [f"{name} ({kind})" for name, kind in list(inside.items())[:_MAX_NAMED]]
+    more = f" and {len(inside) - len(first)} more" if len(inside) > len(first) else ""
+    raise DataError(
+        f"{path}: is no recording, but holds {', '.join(first)}{more}; name one of them, such as "
+        f"{path / next(iter(inside))}"
+    )
+
+
+def _is_named(file: Path, reader: Reader) -> bool:
+    """Tell whether a reader takes a file, which is also called as recordings are: an archive
+    begins as a `.npz` does.
+    """
+    return file.suffix in _FILES and file.is_file() and reader.is_file(file)
+
+
+def _recordings_in(path: Path) -> dict[str, str]:
+    """Return the kinds of the recordings in a folder, by their names."""
+    found = {}
+    for child in sorted(path.iterdir())[:_MAX_LOOKED_AT]:
+        try:
+            kinds = [
+                reader.kind
+                for reader in _readers()
+                if (reader.is_folder(child) if child.is_dir() else _is_named(child, reader))
+            ]
+        except (OSError, DataError):  # not readable, or damaged
+            continue
+        if kinds:
+            found[child.name] = kinds[0]
+    return found
 
 
 def _file_kind(path: Path) -> str | None:

@@ -303,6 +303,6 @@ class RigCalibration:
             P = self._rows.covariance
             rows = self._rows.without_common(field.coefficients)
             out["stereo_field"] = StereoFieldEstimate(
-                field.coefficients, field.covariance, self._rows.rms_px, rows, P
+                field.coefficients, field.covariance, self._rows.stated_px, rows, P
             )
         return out

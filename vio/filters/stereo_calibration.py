@@ -70,7 +70,8 @@ class VerticalDisparityModel:
         self._common: FloatArray = np.zeros((ROW_TERMS, FIELD_TERMS - RIGHT_TERMS))
         self._squares = self._count = 0.0  # of the rows' residuals, in the same memory
         self._matches = 0  # of the last frame
-        self.rms_px = 0.0  # of the field over the matches
+        self._field_squares = self._field_count = 0.0  # of the field, in the same memory
+        self.rms_px = 0.0  # of the field over the last matches
         # of 1, x, y, x y, x^2, y^2, d, in focal lengths
         self.coefficients: FloatArray = np.zeros(ROW_TERMS)
 
@@ -99,6 +100,8 @@ class VerticalDisparityModel:
         misfits, weights, squares = loops.fitted_rows(basis, rows, weight, solution)
         self._squares = _ROWS.memory * self._squares + misfits
         self._count = _ROWS.memory * self._count + weights
+        self._field_squares = _ROWS.memory * self._field_squares + squares
+        self._field_count = _ROWS.memory * self._field_count + len(z)
         self.rms_px = math.sqrt(squares / len(z))
 
     def without_common(self, stereo: FloatArray) -> FloatArray:
@@ -134,6 +137,13 @@ class VerticalDisparityModel:
         """
         full = len(self._shifts) == _SHIFT_FRAMES
         return abs(sum(self._shifts)) / _SHIFT_FRAMES if full else 0.0
+
+    @property
+    def stated_px(self) -> float:
+        """Root mean square of the field over the matches of all frames: wherever in the image the
+        features of the last one lie, that is what is stated.
+        """
+        return math.sqrt(self._field_squares / self._field_count) if self._field_count else 0.0
 
     @property
     def offset_px(self) -> float | None:

@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vio.calibration.severity import StereoError
 from vio.datasets.samples import motion_samples
+from vio.filters.stereo_calibration import VerticalDisparityModel
 from vio.findings import Finding
 from vio.geometry.rectify import field_of_view
 from vio.geometry.stereo import StereoCamera
@@ -18,7 +20,7 @@ from vio.imu.findings import InertialFinding
 from vio.imu.sampling import sampled_hz
 from vio.inspection.finding import Inspection, Part
 from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
-from vio.inspection.pictures import depths_part, images_part, rows_parts
+from vio.inspection.pictures import calibration_part, depths_part, images_part, rows_part
 from vio.monitor.inertial import InertialCheck
 from vio.numerics.robust import robust_sigma
 from vio.protocols import Dataset, Frontend
@@ -66,17 +68,23 @@ def inspect_recording(
     frames_seen = range(len(recording.frame_times_ns))[slice(*span)]
     times_ns = recording.frame_times_ns[slice(*span)]
     parts = [frames_part(times_ns), camera_part(recording)]
+    off: StereoError | None = None  # the calibration
     if recording.has_images and frames_seen:
         frames = _spread(dataset, frames_seen, pairs, progress)
         parts.append(images_part(frames))
-        if recording.camera.kind != "mono":
-            parts += (
-                rows_parts(frames) if recording.camera.kind == "stereo" else [depths_part(frames)]
-            )
+        if recording.camera.kind == "rgbd":
+            parts.append(depths_part(frames))
+        elif recording.camera.kind == "stereo":
+            stereo, off = rows_part(frames)
+            parts.append(stereo)
     parts += _motion_parts(dataset, span, times_ns)
     if recording.has_images and tracked > 1 and frames_seen:
         tracked = _frames_to_track(recording, times_ns, tracked)
-        parts += _tracking_parts(dataset, build_frontend, frames_seen[:tracked], progress)
+        seen = _track(dataset, build_frontend(dataset), frames_seen[:tracked], progress)
+        parts += _tracking_parts(recording, seen)
+        off = _as_in_a_run(off, seen.rows)
+    if off is not None:
+        parts.append(calibration_part(off))
     parts += [_reference_part(recording, times_ns), _missing_part(recording)]
     return Inspection(tuple(parts), recording.notes)
 
@@ -158,16 +166,19 @@ def _motion_parts(dataset: Dataset, span: tuple[int, int | None], times_ns: IntA
     return parts
 
 
-def _tracking_parts(
-    dataset: Dataset,
-    build_frontend: Callable[[Dataset], Frontend],
-    frames: range,
-    progress: Callable[[int, int], None],
-) -> list[Part]:
-    """Track some frames, and compare the IMU with the images' motion as a run does."""
-    recording = dataset.recording
+def _as_in_a_run(by_pairs: StereoError | None, rows: VerticalDisparityModel) -> StereoError | None:
+    """Return what the calibration is off by with the rows as a run learns and states them; where
+    they are too far off for its front end, or nothing was learned, those of single pairs.
+    """
+    learned = rows.offset_px is not None
+    if not learned or (by_pairs is not None and by_pairs.grade == "unusable"):
+        return by_pairs
+    return StereoError(rows.stated_px, 0.0 if by_pairs is None else by_pairs.seen_px)
+
+
+def _tracking_parts(recording: Recording, seen: _Tracked) -> list[Part]:
+    """Describe tracked frames, and how the IMU fits the images' motion as a run compares them."""
     mono = recording.camera.kind == "mono"
-    seen = _track(dataset, build_frontend(dataset), frames, progress)
     parts = [_tracked_part(seen, mono=mono)]
     if seen.shifted:
         parts.append(Part("pairs", "of different times", {"shifted": True}, seen.shifted))
@@ -180,6 +191,7 @@ def _tracking_parts(
 class _Tracked:
     """What tracking some frames has shown."""
 
+    rows: VerticalDisparityModel  # of left and right images
     tracked: list[int] = field(default_factory=list)  # features from the frame before, per frame
     matched: list[int] = field(default_factory=list)  # features with depth, per frame
     shifted: list[str] = field(default_factory=list)  # findings about the pairs
@@ -195,7 +207,7 @@ def _track(
     check: InertialCheck | None = None
     if "imu" in recording.motion and recording.T_cam0_imu is not None:
         check = InertialCheck(recording.camera, recording.T_cam0_imu)
-    seen = _Tracked()
+    seen = _Tracked(VerticalDisparityModel(recording.camera))
     for event in dataset.events(frames.start, frames.stop):
         if isinstance(event, StereoFrame):
             output = frontend.process(event)
@@ -203,6 +215,8 @@ def _track(
             seen.matched.append(output.matched)
             seen.shifted += [_shifted_text(f) for f in output.findings if f.code == "pairs-shifted"]
             progress(len(seen.tracked), len(frames))
+            if recording.camera.kind == "stereo":
+                seen.rows.update(output.observations)
             if check is not None:
                 seen.imu_findings += _messages(check.frame(output.observations), mono=mono)
         elif check is not None and isinstance(event, ImuSample):

@@ -157,9 +157,9 @@ def depths_part(frames: Sequence[StereoFrame]) -> Part:
     )
 
 
-def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
+def rows_part(frames: Sequence[StereoFrame]) -> tuple[Part, StereoError | None]:
     """Describe how the rows of left and right images agree, by SIFT matches that assume nothing
-    of the calibration.
+    of the calibration, and what they say of it; None: nothing.
     """
     matches = [
         sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None
@@ -168,7 +168,7 @@ def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
     z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _PICTURES.min_matches)])
     found = row_residuals(z, *_size_of_images(frames))
     if isinstance(found, NotObservable):
-        return [_unmatched_part(found, counts)]
+        return _unmatched_part(found, counts), None
     off = StereoError(found.rms_px, found.disparity_px)
     faults = _rows_faults(found)
     if faults and (turn_deg := _turn_between(frames)):
@@ -176,10 +176,15 @@ def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
             f"the right images are turned by about {turn_deg} degrees against the left ones: turn "
             "them back, or calibrate the pair with images as these"
         ]
-    return [
-        Part("stereo", _rows_text(found, counts), _rows_facts(found), faults),
-        Part("calibration", str(off), {"grade": off.grade, "rows_rms_px": off.rows_px}),
-    ]
+    return Part("stereo", _rows_text(found, counts), _rows_facts(found), faults), off
+
+
+def calibration_part(off: StereoError) -> Part:
+    """Describe how much a calibration is off by the rows, and where the rest shows."""
+    more = ""
+    if off.disparity_px is None and off.grade == "worth calibrating":
+        more = "; what disparities are off by, motion shows (vio run)"
+    return Part("calibration", f"{off}{more}", {"grade": off.grade, "rows_rms_px": off.rows_px})
 
 
 def _size_of_images(frames: Sequence[StereoFrame]) -> tuple[float, float]:

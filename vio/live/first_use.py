@@ -7,14 +7,17 @@ compiles stays in numba's cache, where the run finds it.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import logging
+import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Literal, NamedTuple, TypeAlias
+from typing import IO, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -63,8 +66,13 @@ def compiled_beside(parts: tuple[Part, ...], motion: RunMotion) -> Iterator[None
         compiling.USUAL_S,
     )
     helpers = {
-        part: subprocess.Popen([sys.executable, "-m", __name__, part, motion]) for part in parts
+        part: subprocess.Popen(
+            [sys.executable, "-m", __name__, part, motion], stdout=subprocess.PIPE
+        )
+        for part in parts
     }
+    for helper in helpers.values():
+        threading.Thread(target=_count_loops, args=(helper.stdout,), daemon=True).start()
 
     def wait_for(module: str) -> None:
         for part, helper in helpers.items():
@@ -80,6 +88,18 @@ def compiled_beside(parts: tuple[Part, ...], motion: RunMotion) -> Iterator[None
         for helper in helpers.values():
             helper.terminate()
             helper.wait()
+
+
+def _count_loops(pipe: IO[bytes]) -> None:
+    """Count the loops of a process that compiles, which writes a byte for each."""
+    with pipe:
+        while pipe.read(1):
+            compiling.PROGRESS.count()
+
+
+def _write_count() -> None:
+    with contextlib.suppress(BrokenPipeError):  # nobody counts any more
+        os.write(sys.stdout.fileno(), b".")
 
 
 def compile_part(part: Part, motion: RunMotion) -> None:
@@ -167,13 +187,13 @@ class _Features:
 
 
 def main(argv: list[str]) -> int:
-    """Compile one part for one kind of motion; say on stderr how far that is."""
+    """Compile one part for one kind of motion; write a byte to stdout for each loop."""
     part, motion = argv
     logging.addLevelName(NOTE, "NOTE")
     logging.basicConfig(level=NOTE, format="%(levelname)s: %(message)s", stream=sys.stderr)
     logging.getLogger("vio.monitor").setLevel(logging.ERROR)  # of images that are made up
     gc.disable()  # the compiler makes many objects that stay
-    compiling.label = part
+    compiling.counted_by = _write_count
     compile_part(part, motion)  # type: ignore[arg-type]
     return 0
 

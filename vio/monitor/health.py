@@ -167,20 +167,23 @@ class RunHealth:
         ):
             return []
         self._reported.add("stereo")
-        seen = f"frame {index}: the rows of left and right images differ by {field.rows_rms_px:.2f} px (rms)"
+        seen = f"frame {index}: the rows of left and right images differ"
         figures = {"rows_rms_px": field.rows_rms_px}
         if field.rows_rms_px > _RIG.other_pair_px:
             message = (
-                f"{seen}: left and right are exchanged, the calibration is not that of these "
-                "images, or a camera was moved; `vio calibrate` finds which; what the calibration "
-                "is off by is estimated while running, which may not suffice "
-                "(msckf.calibrate_stereo)"
+                f"{seen} by {field.rows_rms_px:.2f} px (rms): left and right are exchanged, the "
+                "calibration is not that of these images, or a camera was moved; `vio calibrate` "
+                "finds which; what the calibration is off by is estimated while running, which may "
+                "not suffice (msckf.calibrate_stereo)"
             )
             return [Finding("other-calibration", message, index, lasts=True, figures=figures)]
+        # What is corrected needs no figure here: the run ends with one.
+        grade = rows_grade(field.rows_rms_px)
+        size = "" if grade == "worth calibrating" else f" by {field.rows_rms_px:.2f} px (rms)"
+        verdict = "" if grade == "worth calibrating" else f", {grade}"
         message = (
-            f"{seen} in a smooth pattern: the stereo calibration is off, "
-            f"{rows_grade(field.rows_rms_px)}; what it is "
-            "off by is estimated while running (msckf.calibrate_stereo)"
+            f"{seen}{size} in a smooth pattern: the stereo calibration is off{verdict}; by how "
+            "much is estimated while running, and stated at the end (msckf.calibrate_stereo)"
         )
         return [Finding("stereo-calibration-off", message, index, figures=figures)]
 

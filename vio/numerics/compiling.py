@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,22 +14,30 @@ from vio.errors import NOTE
 log = logging.getLogger(__name__)
 
 USUAL_S = 60.0  # of CPU time that the loops of a usual run take
-USUAL_LOOPS = 110  # that a usual run compiles, and what each part of it does
-LOOPS_OF = {"frontend": 45, "filter": 75}
+USUAL_LOOPS = 170  # of them, in a usual run on what `vio demo` renders
 # Packages of the loops of each part of a run.
 PACKAGES = {"frontend": "vio.frontend", "filter": "vio.filters"}
 _LINE_S = 10.0  # between two lines
 
 # Called with the module of a loop, before numba compiles or loads it.
 before_first_call: Callable[[str], None] | None = None
-label = ""  # what this process compiles, in its lines
+# Called with each loop in place of a line; the process that waits for this one counts it.
+counted_by: Callable[[], None] | None = None
+
+
+def _level() -> int:
+    """Return the level of a line: in a program that has no handler for notes, one that shows."""
+    return NOTE if logging.getLogger().hasHandlers() else logging.WARNING
 
 
 class Progress:
-    """Counts the loops that this process compiles, and says every few seconds how many."""
+    """Counts the loops that this process, and those that it waits for, compile, and says every few
+    seconds how many.
+    """
 
     def __init__(self) -> None:
         self.compiled = 0
+        self._counting = threading.Lock()
         self._depth = 0  # a loop is compiled while another one that calls it is
         self._said_s = time.monotonic()
 
@@ -49,14 +58,24 @@ class Progress:
     def begin(self) -> None:
         """Count a loop."""
         self._depth += 1
-        self.compiled += 1
-        now_s = time.monotonic()
-        if now_s - self._said_s < _LINE_S:
-            return
-        self._said_s = now_s
-        of = f" of the {label}" if label else ""
-        about = max(LOOPS_OF.get(label, USUAL_LOOPS), self.compiled)
-        log.log(NOTE, "compiling loops%s, once: %d of about %d", of, self.compiled, about)
+        self.count()
+
+    def count(self) -> None:
+        """Count a loop that this process, or one beside it, begins to compile."""
+        with self._counting:
+            self.compiled += 1
+            now_s = time.monotonic()
+            due = now_s - self._said_s >= _LINE_S
+            self._said_s = now_s if due else self._said_s
+        if counted_by is not None:
+            counted_by()
+        elif due:
+            log.log(_level(), "%s", self.line())
+
+    def line(self) -> str:
+        """Return how many loops were compiled, of how many if there are not more than usual."""
+        of = f" of about {USUAL_LOOPS}" if self.compiled < USUAL_LOOPS else ""
+        return f"compiling loops, once: {self.compiled}{of}"
 
     def end(self) -> None:
         """End a loop."""

@@ -15,6 +15,7 @@ from vio.report.words import run_figures, smaller_is_better
 from vio.runs.finished import FinishedRun
 
 _Value = TypeVar("_Value")
+_SAME_PERCENT = 0.5  # of a change that rounds to none
 _MIN_FRAMES = 3  # in common, for an alignment
 
 
@@ -90,4 +91,5 @@ def _change(first: float | None, value: float | None) -> str:
     """Return the change of a figure in words; nothing where there is none."""
     if not first or value is None or value == first:
         return ""
-    return f" ({100 * (value / first - 1):+.0f} %)"
+    percent = 100 * (value / first - 1)
+    return " (the same)" if abs(percent) < _SAME_PERCENT else f" ({percent:+.0f} %)"

@@ -151,7 +151,8 @@ def _path_3d(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSec
     figure.add_trace(
         go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, **_named(figure, "landmarks"))
     )
-    figure.update_layout(height=620, scene=_equal_scales(high - low))
+    # Its view is as wide as it is high: a higher or narrower one cuts the path off on a phone.
+    figure.update_layout(height=480, scene=_equal_scales(high - low), margin={"l": 0, "r": 0})
     return ReportSection("Path in three dimensions", figure, "Turn it with the mouse.")
 
 

@@ -144,7 +144,7 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
     innovations = m.get("innovation_ratio")
     return {
         "frames": str(len(run.estimates)),
-        "path (m)": f"{path_length_m(run.trajectory.positions):.2f}",
+        "path": f"{path_length_m(run.trajectory.positions):.2f} m of {run.trajectory.body}",
         "back end": f"{m.get('backend', '–')}, motion {m.get('motion', '–')}",
         "ATE": ate,
         "largest error": largest,

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from vio._version import __version__
 from vio.calibration.severity import StereoError
-from vio.calibration.stereo_field import PARAMETERS
+from vio.calibration.stereo_field import PARAMETERS, disparity_off
 from vio.config import Config, describe, to_yaml
 from vio.dataclass import dataclass
 from vio.errors import CalibrationError, DataError, EvaluationError
@@ -440,12 +440,8 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
     coefficients = f * field.coefficients
     sigmas = f * np.sqrt(np.diag(field.covariance))
     seen = [px for px in result.frames.column("disparity_median_px") if px is not None and px == px]
-    off = StereoError(
-        field.rows_rms_px,
-        robust.median(seen or [0.0]),
-        -float(coefficients[0]),
-        float(sigmas[0]),
-    )
+    disparity, sigma = disparity_off(field)
+    off = StereoError(field.rows_rms_px, robust.median(seen or [0.0]), f * disparity, f * sigma)
     if not result.recording.camera.is_cylinder:
         try:
             found = result.calibrated_rig()
