@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gc
 import logging
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -57,6 +56,8 @@ def compiled_beside(parts: tuple[Part, ...], motion: RunMotion) -> Iterator[None
     if compiling.before_first_call is not None or prebuilt.is_usable() or is_cached():
         yield
         return
+    import subprocess  # none is started where there is machine code
+
     log.log(
         NOTE,
         "compiling loops, once for this installation: about %.0f s of computing",
