@@ -841,3 +841,16 @@ def test_the_help_of_run_names_every_kind_of_recording() -> None:
     named = re.search(r"sets it \(([\w\s,]+)\)", commands.choices["run"].format_help())
     assert named is not None
     assert {word.strip() for word in named[1].split(",")} == set(readers())
+
+
+def test_a_start_searches_no_cycles_of_objects() -> None:
+    code = """
+import atexit, gc
+searches = lambda: sum(kind["collections"] for kind in gc.get_stats())
+from vio.cli import main
+before = searches()
+atexit.register(lambda: print(searches() == before, gc.get_freeze_count() > 0))
+main(["run", "--help"])
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout.splitlines()[-1] == "True True"

@@ -260,26 +260,28 @@ def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
 def _scaled(rig: Rig, baseline: float, focal: float) -> Rig:
     """Return a rig whose baseline and focal lengths are longer by factors exp(baseline) and
     exp(focal), (R4).
+    """
+    cam1, T_cam1_cam0 = rig.right
+    T = T_cam1_cam0.copy()
+    T[:3, 3] *= math.exp(baseline)
+    return replace(rig, cam0=_longer(rig.cam0, focal), cam1=_longer(cam1, focal), T_cam1_cam0=T)
+
+
+def _longer(camera: CameraModel, focal: float) -> CameraModel:
+    """Return a camera whose focal lengths are longer by a factor exp(focal).
 
     A pixel's ray is nearer to the axis by exp(focal), which the coefficients of the
     radial-tangential model follow, each by the power of the radius that it belongs to. Other models
     keep theirs: the same near the axis.
     """
-
-    def lens(camera: CameraModel) -> CameraModel:
-        powers = camera.lens.radius_powers(len(camera.coefficients))
-        coefficients = tuple(
-            c * math.exp(n * focal) for c, n in zip(camera.coefficients, powers, strict=True)
-        )
-        factor = math.exp(focal)
-        return replace(
-            camera, fu=factor * camera.fu, fv=factor * camera.fv, coefficients=coefficients
-        )
-
-    cam1, T_cam1_cam0 = rig.right
-    T = T_cam1_cam0.copy()
-    T[:3, 3] *= math.exp(baseline)
-    return replace(rig, cam0=lens(rig.cam0), cam1=lens(cam1), T_cam1_cam0=T)
+    if focal == 0:
+        return camera
+    powers = camera.lens.radius_powers(len(camera.coefficients))
+    coefficients = tuple(
+        c * math.exp(n * focal) for c, n in zip(camera.coefficients, powers, strict=True)
+    )
+    factor = math.exp(focal)
+    return replace(camera, fu=factor * camera.fu, fv=factor * camera.fv, coefficients=coefficients)
 
 
 def field_of(camera: StereoCamera, parameters: FloatArray) -> DisplacementField:
@@ -373,18 +375,26 @@ class _Frame:
         given = self.given
         named = dict(zip(PARAMETERS, x.tolist(), strict=True))
         k, k2, q1, q2 = (named[name] for name in _BOTH)
+        longer = float(radial_focal(self.camera) @ [k, k2])
         b, T_cam1_cam0 = given.right
-        b = replace(b, cu=b.cu + b.fu * named["cu"], cv=b.cv + b.fv * named["cv"])
-        b = replace(b, fu=b.fu * (1 + named["fu"]), fv=b.fv * (1 + named["fv"]))
+        b = replace(
+            b,
+            fu=b.fu * (1 + named["fu"]),
+            fv=b.fv * (1 + named["fv"]),
+            cu=b.cu + b.fu * named["cu"],
+            cv=b.cv + b.fv * named["cv"],
+        )
         cam0 = _bent(given.cam0, (k, k2), (q1, q2))
         cam1 = _bent(b, (k, k2), (q1 + named["p1"], q2 + named["p2"]))
         R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0
         centre = se3_inverse(T_cam1_cam0)[:3, 3]
         down = self.R_rect_cam0[1] * named["ty"] * np.linalg.norm(centre)
         centre = (centre + down) / np.hypot(1.0, named["ty"])
-        out = replace(given, cam0=cam0, cam1=cam1, T_cam1_cam0=se3_from_parts(R, -R @ centre))
-        longer = float(radial_focal(self.camera) @ [k, k2])
-        return _scaled(out, longer, -longer)
+        T = se3_from_parts(R, -R @ centre)
+        T[:3, 3] *= math.exp(longer)
+        return replace(
+            given, cam0=_longer(cam0, -longer), cam1=_longer(cam1, -longer), T_cam1_cam0=T
+        )
 
     def as_seen(self, x: FloatArray) -> FloatArray:
         """Return where the given rectification shows the grid's pixels (N, 4) if it is off by

@@ -11,6 +11,7 @@ Ctrl-C, 143 ended by SIGTERM, 129 by SIGHUP; the last three leave no unfinished 
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
 import difflib
 import gc
@@ -55,7 +56,7 @@ _FILES = {"eval": "evaluate", "calibrate-rig": "calibrate_rig", "imu-noise": "im
 COMMANDS = tuple(name for names in BY_PURPOSE.values() for name in names)
 
 # Objects made before Python looks for cycles among the young ones: a tenth of a command's start
-# went into that search, over modules and samples that stay.
+# went into that search, over modules and samples that stay. At its end, another tenth did.
 _GC_OBJECTS = 100_000
 # bytes; a short run of MH_01 takes 976 MB, and OpenCV fails to load in 820
 _MIN_ADDRESS_SPACE = 1_000_000_000
@@ -179,8 +180,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         # a terminal that cannot show a character must not end the program
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    args = _parse(argv)
     gc.set_threshold(_GC_OBJECTS)
+    atexit.register(gc.freeze)
+    args = _parse(argv)
     logging.addLevelName(NOTE, "NOTE")
     logging.basicConfig(
         level=logging.DEBUG if args.debug else NOTE,

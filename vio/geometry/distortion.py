@@ -7,6 +7,7 @@ each, with their sources.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -56,7 +57,7 @@ class CameraModel:
                 f"unknown distortion model {self.model!r}; use one of {', '.join(LENSES)}"
             )
         values = (self.fu, self.fv, self.cu, self.cv, *self.coefficients)
-        if not np.all(np.isfinite(values)):
+        if not all(map(math.isfinite, values)):
             raise CalibrationError(
                 f"camera intrinsics are not finite: {values}; check the calibration file"
             )

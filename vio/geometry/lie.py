@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import CalibrationError
-
-FloatArray = npt.NDArray[np.float64]
+from vio.numerics.arrays import FloatArray as FloatArray
 
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 # Below this angle the closed forms suffer from cancellation and the Taylor series is exact to

@@ -11,7 +11,6 @@ import contextlib
 import gc
 import logging
 import os
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -60,6 +59,8 @@ def compiled_beside(parts: tuple[Part, ...], motion: RunMotion) -> Iterator[None
     if compiling.before_first_call is not None or prebuilt.is_usable() or is_cached():
         yield
         return
+    import subprocess  # none is started where there is machine code
+
     log.log(
         NOTE,
         "compiling loops, once for this installation: about %.0f s of computing",

@@ -18,8 +18,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from vio.geometry.lie import FloatArray
 from vio.numerics import compiling, prebuilt
+from vio.numerics.arrays import FloatArray
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from vio.geometry.lie import FloatArray
+from vio.numerics.arrays import FloatArray
 
 _MEDIAN_TO_SIGMA = 1.4826  # standard deviation over median absolute value of a normal distribution
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
-from vio.geometry.lie import FloatArray
+from vio.numerics.arrays import FloatArray
 
 _LARGE = 10_000  # unknowns
 _AT_ONCE = 32  # blocks: right-hand sides are dense

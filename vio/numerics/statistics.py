@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from vio.geometry.lie import FloatArray
+from vio.numerics.arrays import FloatArray
 from vio.numerics.compiled import solve_positive
 from vio.numerics.scipy_extensions import special
 

@@ -21,9 +21,13 @@ from vio.geometry.lenses.model import (
 )
 from vio.geometry.lenses.pinhole import pinhole, pinhole_by_point
 from vio.geometry.lie import FloatArray
+from vio.numerics.compiled import compiled
 
 _NEWTON_STEPS = 30
 _NEWTON_TOLERANCE = 1e-11  # on the normalised image plane: about 1e-8 px
+_MAX_NEWTON_STEP = 0.5  # on the normalised image plane
+_MIN_DETERMINANT = 1e-6
+_SAME_POINT = 1e-8  # on the normalised image plane
 
 
 def _five(c: Coefficients) -> tuple[float, float, float, float, float]:
@@ -32,58 +36,129 @@ def _five(c: Coefficients) -> tuple[float, float, float, float, float]:
     return k1, k2, p1, p2, c[4] if len(c) > 4 else 0.0
 
 
-def _divisor(c: Coefficients, r2: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Divisor of the rational model's radial factor and its derivative with respect to `r2`.
+@lru_cache(maxsize=256)
+def _eight(c: Coefficients) -> FloatArray:
+    """Return all coefficients (8,); those that are absent are zero, and change nothing."""
+    return np.array([*c, *(0.0,) * (8 - len(c))])
 
-    None: not rational.
-    """
+
+def _divisor(c: Coefficients, r2: FloatArray) -> FloatArray | None:
+    """Divisor of the rational model's radial factor; None: not rational."""
     if len(c) < 8:
         return None
     k4, k5, k6 = c[5:]
-    return 1 + r2 * (k4 + r2 * (k5 + r2 * k6)), k4 + r2 * (2 * k5 + r2 * 3 * k6)
+    return 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
 
 
-def distort(c: Coefficients, xy: FloatArray) -> FloatArray:
-    """Return points (..., 2) of the plane of tangents with the lens's distortion."""
-    k1, k2, p1, p2, k3 = _five(c)
-    x = xy[..., 0]
-    y = xy[..., 1]
+@compiled
+def _distorted_point(k: FloatArray, x: float, y: float) -> tuple[float, float]:
+    """Return a point of the plane of tangents with distortion by coefficients (8,)."""
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    if (divisor := _divisor(c, r2)) is not None:
-        radial = radial / divisor[0]
-    out = np.empty(xy.shape)
-    out[..., 0] = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    out[..., 1] = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return out
+    radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    radial = radial / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+    u = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x)
+    v = y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y
+    return u, v
+
+
+@compiled
+def _distorted_by_point(k: FloatArray, x: float, y: float) -> tuple[float, float, float]:
+    """Derivatives of `_distorted_point`: u by x, v by y, and u by y, which is v by x."""
+    r2 = x * x + y * y
+    below = 1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
+    below_D_r2 = k[5] + r2 * (2 * k[6] + r2 * 3 * k[7])
+    above = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    above_D_r2 = 2 * k[0] + r2 * (4 * k[1] + r2 * 6 * k[4])  # twice
+    radial = above / below
+    slope = (above_D_r2 - 2 * above * below_D_r2 / below) / below
+    u_D_x = radial + slope * x * x + 2 * k[2] * y + 6 * k[3] * x
+    v_D_y = radial + slope * y * y + 6 * k[2] * y + 2 * k[3] * x
+    return u_D_x, v_D_y, slope * x * y + 2 * k[2] * x + 2 * k[3] * y
+
+
+@compiled
+def _distort_points(
+    k: FloatArray, limit: float, xy: FloatArray, valid: BoolArray, out: FloatArray
+) -> None:
+    """Write the valid points (N, 2) with distortion, and clear `valid` (N,) beyond a radius; the
+    others are written as zero.
+    """
+    for n in range(len(xy)):
+        x = xy[n, 0]
+        y = xy[n, 1]
+        if not valid[n] or not np.sqrt(x * x + y * y) < limit:
+            valid[n] = False
+            x = 0.0
+            y = 0.0
+        out[n, 0], out[n, 1] = _distorted_point(k, x, y)
+
+
+@compiled
+def _distort_points_by_xy(k: FloatArray, xy: FloatArray, out: FloatArray) -> None:
+    """Write the derivatives (N, 2, 2) of points (N, 2) with distortion by the points."""
+    for n in range(len(xy)):
+        u_D_x, v_D_y, u_D_y = _distorted_by_point(k, xy[n, 0], xy[n, 1])
+        out[n, 0, 0] = u_D_x
+        out[n, 1, 1] = v_D_y
+        out[n, 0, 1] = out[n, 1, 0] = u_D_y
+
+
+@compiled
+def _undistort_points(
+    k: FloatArray, limit: float, target: FloatArray, xy: FloatArray, valid: BoolArray
+) -> None:
+    """Improve points xy (N, 2) by Newton's method until their distorted ones are those wanted
+    (N, 2), all with the same number of steps; write where that was reached within a radius (N,).
+    """
+    for step in range(_NEWTON_STEPS + 1):
+        is_found = True
+        for n in range(len(xy)):
+            u, v = _distorted_point(k, xy[n, 0], xy[n, 1])
+            du = abs(u - target[n, 0])
+            dv = abs(v - target[n, 1])
+            is_found = is_found and du < _NEWTON_TOLERANCE and dv < _NEWTON_TOLERANCE
+        if is_found or step == _NEWTON_STEPS:
+            break
+        for n in range(len(xy)):
+            x = xy[n, 0]
+            y = xy[n, 1]
+            u, v = _distorted_point(k, x, y)
+            u_D_x, v_D_y, u_D_y = _distorted_by_point(k, x, y)
+            det = u_D_x * v_D_y - u_D_y * u_D_y
+            if abs(det) < _MIN_DETERMINANT:
+                det = _MIN_DETERMINANT
+            du = u - target[n, 0]
+            dv = v - target[n, 1]
+            dx = (v_D_y * du - u_D_y * dv) / det
+            dy = (u_D_x * dv - u_D_y * du) / det
+            xy[n, 0] = x - min(max(dx, -_MAX_NEWTON_STEP), _MAX_NEWTON_STEP)
+            xy[n, 1] = y - min(max(dy, -_MAX_NEWTON_STEP), _MAX_NEWTON_STEP)
+    for n in range(len(xy)):
+        x = xy[n, 0]
+        y = xy[n, 1]
+        u, v = _distorted_point(k, x, y)
+        du = u - target[n, 0]
+        dv = v - target[n, 1]
+        near = np.sqrt(du * du + dv * dv) < _SAME_POINT
+        valid[n] = valid[n] and near and np.sqrt(x * x + y * y) < limit
 
 
 def distort_by_xy(c: Coefficients, xy: FloatArray) -> FloatArray:
-    """Derivative (..., 2, 2) of `distort` by its points (..., 2)."""
-    k1, k2, p1, p2, k3 = _five(c)
-    x = xy[..., 0]
-    y = xy[..., 1]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * k1 + r2 * (4 * k2 + r2 * 6 * k3)
-    if (divisor := _divisor(c, r2)) is not None:
-        below, below_D_r2 = divisor
-        radial, slope = radial / below, (slope - 2 * radial * below_D_r2 / below) / below
-    out = np.empty((*xy.shape[:-1], 2, 2))
-    out[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    out[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    out[..., 0, 1] = out[..., 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    return out
+    """Derivative (..., 2, 2) of points (..., 2) with distortion by these points."""
+    points = np.ascontiguousarray(xy).reshape(-1, 2)
+    out = np.empty((len(points), 2, 2))
+    _distort_points_by_xy(_eight(c), points, out)
+    return out.reshape(*xy.shape, 2)
 
 
 def distort_by_coefficients(c: Coefficients, xy: FloatArray) -> FloatArray:
-    """Derivative (..., 2, n) of `distort` by its n coefficients."""
+    """Derivative (..., 2, n) of points (..., 2) with distortion by the n coefficients."""
     k1, k2, _, _, k3 = _five(c)
     x = xy[..., 0]
     y = xy[..., 1]
     r2 = x * x + y * y
     divisor = _divisor(c, r2)
-    above = xy if divisor is None else xy / divisor[0][..., None]
+    above = xy if divisor is None else xy / divisor[..., None]
     powers = [r2, r2 * r2, r2**3]
     out = np.empty((*xy.shape[:-1], 2, len(c)))
     out[..., 0] = above * powers[0][..., None]
@@ -93,7 +168,7 @@ def distort_by_coefficients(c: Coefficients, xy: FloatArray) -> FloatArray:
     if len(c) > 4:
         out[..., 4] = above * powers[2][..., None]
     if divisor is not None:
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / divisor[0]
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / divisor
         for k, power in enumerate(powers):
             out[..., 5 + k] = -above * (radial * power)[..., None]
     return out
@@ -125,41 +200,25 @@ def _rational_max_radius(above: tuple[float, ...], below: tuple[float, ...]) -> 
     return float(np.sqrt(min(positive))) if positive else np.inf
 
 
-def _radius(xy: FloatArray) -> FloatArray:
-    """Distance (...) of points (..., 2) from the origin."""
-    x = xy[..., 0]
-    y = xy[..., 1]
-    return np.sqrt(x * x + y * y)
-
-
 def distorted(c: Coefficients, xy: FloatArray, valid: BoolArray) -> tuple[FloatArray, BoolArray]:
     """Return points (..., 2) with distortion, and which of the valid ones (...) are inside the
     model's radius; the others' values are finite.
     """
-    valid = valid & (_radius(xy) < max_radius(c))
-    return distort(c, xy if valid.all() else np.where(valid[..., None], xy, 0.0)), valid
+    points = np.ascontiguousarray(xy).reshape(-1, 2)
+    inside = np.array(valid).reshape(-1)
+    out = np.empty(points.shape)
+    _distort_points(_eight(c), max_radius(c), points, inside, out)
+    return out.reshape(xy.shape), inside.reshape(valid.shape)
 
 
 def undistort(c: Coefficients, target: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return points (..., 2) without distortion, by Newton's method, and where it converged."""
-    xy = np.where(np.isfinite(target), target, 0.0)
-    goal = xy
-    for _ in range(_NEWTON_STEPS):
-        now = distort(c, xy)
-        residual = now - goal
-        if np.abs(residual).max(initial=0.0) < _NEWTON_TOLERANCE:
-            break
-        J = distort_by_xy(c, xy)
-        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-        det = np.where(np.abs(det) < 1e-6, 1e-6, det)
-        step = np.empty(xy.shape)
-        step[..., 0] = J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1]
-        step[..., 1] = J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]
-        xy = xy - np.minimum(np.maximum(step / det[..., None], -0.5), 0.5)
-    else:
-        now = distort(c, xy)
-    found = _radius(now - target) < 1e-8
-    return xy, np.logical_and(found, _radius(xy) < max_radius(c))
+    finite = np.isfinite(target)
+    goal = np.where(finite, target, 0.0).reshape(-1, 2)
+    xy = goal.copy()
+    valid = finite.all(axis=-1).reshape(-1)
+    _undistort_points(_eight(c), max_radius(c), goal, xy, valid)
+    return xy.reshape(target.shape), valid.reshape(target.shape[:-1])
 
 
 class RadialTangential(Lens):
