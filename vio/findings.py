@@ -212,6 +212,12 @@ CODES: dict[str, Code] = {
         "rows of left and right images differ by far more than a calibration can be off",
         "check that calibration and images belong together",
     ),
+    "calibration-misread": Code(
+        "unusable",
+        "rows of left and right agree by another reading of the calibration or the images, and do "
+        "not as it was read",
+        "correct what the message names",
+    ),
     "scale-off": Code(
         "degraded",
         "baseline or focal length differ from the calibration, by the motion sensor",

@@ -7,6 +7,7 @@ in the unit of its header. Names alone are read by their size, and by how far ap
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,6 +19,7 @@ from vio.datasets.frame_times import PAIRED_NS, nearest, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImagePairs
 from vio.datasets.images import list_images
+from vio.datasets.lost_images import CountedApart
 from vio.datasets.sides import without_side
 from vio.datasets.tables import drive_times, is_date, table_rows
 from vio.datasets.unused import Layout
@@ -54,7 +56,7 @@ def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple
     Raises:
         DataError: the names share nothing.
     """
-    keys = _partner_keys(lefts, rights)
+    keys = _keys_of_lists(lefts, rights) or _partner_keys(lefts, rights)
     right_of = {key: k for k, key in enumerate(keys[1])}
     if len(right_of) < len(rights) and -1 not in right_of:
         raise DataError(
@@ -75,6 +77,23 @@ def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple
         return pairs, rolled
     skipped = f"{alone[0]} left and {alone[1]} right images have no partner and are skipped"
     return pairs, (skipped, *rolled, *_shift_doubt(lefts, rights, rows))
+
+
+def counted_apart(lefts: ImageFiles, rights: ImageFiles, pairs: ImagePairs) -> CountedApart | None:
+    """Return all files where those of one number are paired, the first ones have one number, no number
+    is left out, and one camera has more images; None: their names tell which belong together.
+    """
+    if len(lefts) == len(rights) or len(pairs) != min(len(lefts), len(rights)):
+        return None
+    if any(_last_number(left) != _last_number(right) for left, right in (pairs[0], pairs[-1])):
+        return None  # paired by times
+    numbers = [[_last_number(file) for file in files] for files in (lefts, rights)]
+    first = numbers[0][0]
+    if not isinstance(first, int) or any(
+        found != list(range(first, first + len(found))) for found in numbers
+    ):
+        return None
+    return None if _name_times(lefts) is not None else CountedApart(lefts, rights)
 
 
 def rolled_doubt(files: ImageFiles) -> tuple[str, ...]:
@@ -158,6 +177,39 @@ def _partner_keys(lefts: ImageFiles, rights: ImageFiles) -> list[list[str | int]
     if left_ns is not None and right_ns is not None and 2 * shared < min(len(lefts), len(rights)):
         return _keys_of_times(left_ns, right_ns)
     return keys if shared else _keys_in_names(lefts, rights)
+
+
+def _keys_of_lists(lefts: ImageFiles, rights: ImageFiles) -> list[list[str | int]] | None:
+    """Return what files are paired by where each camera has its own list of times, and these pair more
+    of them than their names; None: names decide.
+    """
+    left_ns = _own_times(lefts, rights.folder)
+    right_ns = _own_times(rights, lefts.folder)
+    if left_ns is None or right_ns is None:
+        return None
+    right_of = {file.stem: k for k, file in enumerate(rights)}
+    rows = [(k, right_of[file.stem]) for k, file in enumerate(lefts) if file.stem in right_of]
+    left_rows, right_rows = np.array(rows, dtype=np.int64).reshape(-1, 2).T
+    apart_ns = np.abs(right_ns[right_rows] - left_ns[left_rows])
+    keys = _keys_of_times(left_ns, right_ns)
+    by_time = sum(key != -1 for key in keys[1])
+    return keys if by_time > int((apart_ns <= PAIRED_NS).sum()) else None
+
+
+def _own_times(files: ImageFiles, other: Path) -> IntArray | None:
+    """Return the times (F,) of all images of a camera by a list in its folder or the one above it,
+    which is not that of the other camera's images; None: it has none.
+    """
+    folders = [f for f in (files.folder, files.folder.parent) if f not in (other, other.parent)]
+    named = ("times.txt", "timestamps.txt", "data.csv")
+    file = next((f / name for f in folders for name in named if (f / name).is_file()), None)
+    if file is None:
+        return None
+    with contextlib.suppress(DataError):
+        if file.name == "data.csv":
+            return _listed_times(file, files, [])
+        return times_of(file, FilePairs(files, files))
+    return None
 
 
 def _keys_in_names(lefts: ImageFiles, rights: ImageFiles) -> list[list[str | int]]:

@@ -35,9 +35,10 @@ from vio.datasets.companions import (
 from vio.datasets.euroc import is_euroc_folder, read_euroc
 from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
-from vio.datasets.image_times import frame_times, pair_files, times_of
+from vio.datasets.image_times import counted_apart, frame_times, pair_files, times_of
 from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
 from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
+from vio.datasets.lost_images import CountedApart, pairs_in_step
 from vio.datasets.reader import Reader
 from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.rigs.eth3d import FOLDERS as ETH3D_FOLDERS
@@ -289,6 +290,7 @@ class _Images:
     depths: Sequence[Path] | None = None  # depth images; None: there are none
     listed_ns: IntArray | None = None  # times in TUM's lists; None: those of any plain folder
     side_by_side: bool = False  # each file holds a pair
+    counted: CountedApart | None = None  # each camera may have numbered its own images
 
 
 def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
@@ -311,8 +313,11 @@ def read_plain(path: Path, settings: DatasetSettings) -> ImageDataset:
             f"{path}: holds no pair of image folders ({names} or others) but {seen_folders(path)}; "
             "name the two with --set dataset.folders=LEFT,RIGHT"
         )
-    pairs, notes = pair_files(list_images(layout.left), list_images(layout.right))
-    return _read("plain", layout, _Images(pairs, notes), settings)
+    lefts = list_images(layout.left)
+    rights = list_images(layout.right)
+    pairs, notes = pair_files(lefts, rights)
+    images = _Images(pairs, notes, counted=counted_apart(lefts, rights, pairs))
+    return _read("plain", layout, images, settings)
 
 
 def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
@@ -464,7 +469,7 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
     has_depths = images.depths is not None
     read = ReadImages(kind, layout, (file, rig), times, notes, used, has_depths=has_depths)
     parts = read_companions(read, settings)
-    return ImageDataset(
+    dataset = ImageDataset(
         *parts,
         images.pairs,
         imu_noise=rig.imu_noise,
@@ -473,6 +478,12 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
         depth_factor=depth_factor,
         side_by_side=images.side_by_side,
     )
+    if images.counted is None or settings.cameras == 1:
+        return dataset
+    found = pairs_in_step(dataset, images.counted)
+    if found is None:
+        return dataset
+    return _read(kind, layout, _Images(found[0], (found[1],)), settings)
 
 
 def _file_and_rig(
@@ -498,12 +509,14 @@ def _file_and_rig(
 
 
 def _other_lists(kind: str, layout: Layout, times_file: Path | None) -> Iterator[Path]:
-    """Yield the lists of EuRoC's form that repeat the times of the images."""
+    """Yield the lists of the right camera, and of EuRoC's form, that repeat times of the images."""
     of_left = layout.left.parent / "data.csv"
     if kind != "plain" and times_file == layout.left:
         yield of_left
     if times_file == of_left:
         yield layout.right.parent / "data.csv"
+    if times_file is not None and times_file.parent == layout.left:
+        yield layout.right / times_file.name
 
 
 def _choose_cameras(path: Path, colour: bool | None) -> tuple[int, int]:

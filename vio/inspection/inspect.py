@@ -9,7 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.calibration.severity import StereoError
+from vio.cameras.rig import Rectifier
 from vio.datasets.samples import motion_samples
+from vio.errors import DataError
 from vio.filters.stereo_calibration import VerticalDisparityModel
 from vio.findings import Finding
 from vio.geometry.rectify import field_of_view
@@ -23,7 +25,7 @@ from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
 from vio.inspection.pictures import calibration_part, depths_part, images_part, rows_part
 from vio.monitor.inertial import InertialCheck
 from vio.numerics.robust import robust_sigma
-from vio.protocols import Dataset, Frontend
+from vio.protocols import Dataset, Frontend, RectifyingDataset
 from vio.records import (
     NS_PER_S,
     ImuRecord,
@@ -75,7 +77,7 @@ def inspect_recording(
         if recording.camera.kind == "rgbd":
             parts.append(depths_part(frames))
         elif recording.camera.kind == "stereo":
-            stereo, off = rows_part(frames)
+            stereo, off = rows_part(frames, _rectifier(dataset))
             parts.append(stereo)
     parts += _motion_parts(dataset, span, times_ns)
     if recording.has_images and tracked > 1 and frames_seen:
@@ -87,6 +89,13 @@ def inspect_recording(
         parts.append(calibration_part(off))
     parts += [_reference_part(recording, times_ns), _missing_part(recording)]
     return Inspection(tuple(parts), recording.notes)
+
+
+def _rectifier(dataset: Dataset) -> Rectifier | None:
+    """Return what rectifies the images of a recording; None: they are as it has them."""
+    if not isinstance(dataset, RectifyingDataset) or dataset.rectifier.maps is None:
+        return None
+    return dataset.rectifier
 
 
 def _frames_to_track(recording: Recording, times_ns: IntArray, tracked: int) -> int:
@@ -137,9 +146,16 @@ def _spread(
         last = min(last, of[0] + _LOOKED_AT.video_frames - 1)
     chosen = np.unique(np.linspace(of[0], last, pairs).astype(int)).tolist()
     frames: list[StereoFrame] = []
+    unusable: DataError | None = None
     for done, k in enumerate(chosen):
-        frames += [event for event in dataset.events(k, k + 1) if isinstance(event, StereoFrame)]
+        try:
+            events = dataset.events(k, k + 1)
+            frames += [event for event in events if isinstance(event, StereoFrame)]
+        except DataError as error:  # as of one damaged image, which a run skips
+            unusable = unusable or error
         progress(done + 1, len(chosen))
+    if unusable is not None and not frames:
+        raise unusable
     return frames
 
 

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vio.calibration.findings import NotObservable
+from vio.calibration.readings import other_reading
 from vio.calibration.severity import StereoError
 from vio.calibration.stereo import RowResiduals, row_residuals
+from vio.cameras.rig import Rectifier
+from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray
 from vio.inspection.finding import Part
 from vio.records import Image, StereoFrame
@@ -157,9 +160,15 @@ def depths_part(frames: Sequence[StereoFrame]) -> Part:
     )
 
 
-def rows_part(frames: Sequence[StereoFrame]) -> tuple[Part, StereoError | None]:
+def rows_part(
+    frames: Sequence[StereoFrame], rectifier: Rectifier | None = None
+) -> tuple[Part, StereoError | None]:
     """Describe how the rows of left and right images agree, by SIFT matches that assume nothing
     of the calibration, and what they say of it; None: nothing.
+
+    Args:
+        frames: of a recording.
+        rectifier: of raw images; None: they were rectified already.
     """
     matches = [
         sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None
@@ -176,6 +185,9 @@ def rows_part(frames: Sequence[StereoFrame]) -> tuple[Part, StereoError | None]:
             f"the right images are turned by about {turn_deg} degrees against the left ones: turn "
             "them back, or calibrate the pair with images as these"
         ]
+    if rectifier is not None and isinstance(rectifier.lenses, StereoRig):
+        reading = other_reading(rectifier.lenses, rectifier.camera, z)
+        faults = faults if reading is None else [str(reading)]
     return Part("stereo", _rows_text(found, counts), _rows_facts(found), faults), off
 
 

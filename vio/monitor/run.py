@@ -205,6 +205,10 @@ class RunMonitor:
         """Report what was found elsewhere, in one line."""
         self._report(code, [line])
 
+    def add(self, finding: Finding) -> None:
+        """Report what was found elsewhere."""
+        self._add([finding])
+
     def refused(self, index: int, reason: str) -> None:
         """Add a frame that the front end refused, with its reason; a row of such frames is
         reported once.

@@ -22,11 +22,14 @@ from vio.files.tables import Records
 from vio.filters.settings import VislamSettings
 from vio.findings import Finding
 from vio.frontend import one_opencv_thread
+from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import late_text, repaired
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, recorded_source
 from vio.live.processor import EventProcessor
+from vio.monitor.reading import ReadingCheck
+from vio.monitor.run import RunMonitor
 from vio.numerics.threads import one_blas_thread
 from vio.protocols import Dataset, Detector, Frontend, RectifyingDataset, Viewer
 from vio.records import (
@@ -265,7 +268,7 @@ def _process(what: _Run, delay: int) -> RunResult:
         taken = _taken_frames(dataset, config, start, stop)
         # these lack the images that come with later ones
         taken -= set(sorted(taken)[len(taken) - abs(state.delay) :])
-        loop = _Loop(state, recorder, shown, taken)
+        loop = _Loop(state, recorder, shown, taken, reading_check(features))
         try:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
@@ -330,6 +333,18 @@ def given_rig(dataset: Dataset) -> Rig | None:
         dataset.imu_noise,
         made.time_offset_s,
     )
+
+
+def reading_check(dataset: object) -> ReadingCheck | None:
+    """Return what tries other readings of a pair's calibration; None: its images are rectified
+    already, or those of one camera.
+    """
+    if not isinstance(dataset, RectifyingDataset) or dataset.rectifier.maps is None:
+        return None
+    rectifier = dataset.rectifier
+    if not isinstance(rectifier.lenses, StereoRig):
+        return None
+    return ReadingCheck(rectifier.lenses, rectifier.camera)
 
 
 def _reopen_map(session: MapSession | None, use: MapUse | None) -> None:
@@ -403,10 +418,24 @@ class _Loop:
     """Takes a recording's events through the processor into the recorder."""
 
     def __init__(
-        self, state: _RunState, recorder: RunRecorder, viewer: Viewer, frames: set[int]
+        self,
+        state: _RunState,
+        recorder: RunRecorder,
+        viewer: Viewer,
+        frames: set[int],
+        reading: ReadingCheck | None,
     ) -> None:
-        """Prepare; `frames` are the numbers of the recording's frames that the run is to take."""
+        """Prepare.
+
+        Args:
+            state: of the run, new or of a checkpoint.
+            recorder: takes the results.
+            viewer: watches each frame.
+            frames: numbers of the recording's frames that the run is to take.
+            reading: tries other readings of the calibration; None: it is of rectified images.
+        """
         self._state = state
+        self._reading = reading
         self._recorder = recorder
         self._viewer = viewer
         self._frames = frames
@@ -474,8 +503,16 @@ class _Loop:
         monitor = self._state.processor.pipeline.monitor
         if monitor.ends_at_shifted_pairs and monitor.pairs_shifted_by:
             raise _PairsShiftedError(monitor.pairs_shifted_by)
+        for result in results:
+            self._check_reading(result, monitor)
         if results:
             self._record(results)
+
+    def _check_reading(self, result: FrameResult, monitor: RunMonitor) -> None:
+        if self._reading is not None:
+            found = self._reading.frame(result.output.observations, monitor.findings)
+            if found is not None:
+                monitor.add(found)
 
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state

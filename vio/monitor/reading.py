@@ -1,0 +1,64 @@
+"""Whether another reading of the calibration explains rows that do not agree, during a run."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vio.calibration.readings import other_reading
+from vio.findings import Finding
+from vio.geometry.distortion import StereoRig
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.records import Observations
+
+_ROWS_OFF = ("stereo-calibration-off", "other-calibration")
+_CODE = "calibration-misread"
+
+
+class _FrameRules(NamedTuple):
+    """Which frames are looked at."""
+
+    looked_at: tuple[int, ...] = (10, 40)  # frames with matches after which readings are tried
+    most: int = 20  # whose matches are kept
+
+
+_FRAMES = _FrameRules()
+
+
+class ReadingCheck:
+    """Tries other readings once rows of left and right were found to differ."""
+
+    def __init__(self, rig: StereoRig, rectified: StereoCamera) -> None:
+        """Begin.
+
+        Args:
+            rig: as the calibration was read.
+            rectified: the camera that it was rectified to.
+        """
+        self._rig = rig
+        self._rectified = rectified
+        self._matches = deque[FloatArray](maxlen=_FRAMES.most)
+        self._frames = 0
+        self._looked = 0
+
+    def frame(self, seen: Observations, findings: Sequence[Finding]) -> Finding | None:
+        """Return the finding after a frame, by its matches and by what was found so far."""
+        self._matches.append(seen.z[seen.has_right])
+        self._frames += 1
+        due = _FRAMES.looked_at[self._looked :]
+        if not due or self._frames < due[0]:
+            return None
+        codes = {finding.code for finding in findings}
+        if _CODE in codes or not codes & set(_ROWS_OFF):
+            return None
+        self._looked += 1
+        found = other_reading(self._rig, self._rectified, np.concatenate(self._matches))
+        if found is None:
+            return None
+        figures = {"rows_rms_px": found.rms_px, "other_rms_px": found.other_px}
+        index = seen.frame_index
+        return Finding(_CODE, f"frame {index}: {found}", index, 0, lasts=True, figures=figures)
