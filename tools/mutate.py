@@ -9,9 +9,10 @@ says which test that was. A mutation that no test detects is a survivor: the exi
 and a test is missing. At the end the tests that detected something run on an unchanged copy, where
 all must pass. Recordings are taken from VIO_DATA.
 
-With --constants, N constants are drawn from a seed in place of the list: numbers at the top of a
-module, each made half as large again (whole numbers by one at least). The tests of such a mutation
-are those of the list for its file, and the test files that name its module.
+With --constants, N constants are drawn from a seed in place of the list, from each part by its
+share: numbers at the top of a module, each times and over 1.5 (whole numbers by one at least). The
+tests of such a mutation are those of the list for its file, and the test files that name its module
+or, where there are none, a module that imports it.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from pathlib import Path
 from typing import Any
 
 from tools.measures import number_constants
-from tools.parts import source_files
+from tools.parts import PARTS, part_of, read_edges, source_files
 
 ROOT = Path(__file__).resolve().parent.parent
 _COPIED = (
@@ -47,7 +48,7 @@ _COPIED = (
     "README.md",
     "pyproject.toml",
 )
-_MAX_S = 900.0
+_MAX_S = 1200.0  # of the tests of one mutation; then one of them does not end
 # The profile is one of tests/conftest.py.
 _PYTEST = ("-q", "--tb=no", "-p", "no:cacheprovider", "--hypothesis-profile=once")
 
@@ -88,45 +89,100 @@ MUTATIONS = read_mutations(Path(__file__).with_name("mutations.txt").read_text(e
 
 
 def constant_mutations(root: Path, words: Sequence[str] = ()) -> list[Mutation]:
-    """Return, for each number at the top of a module, the mutation that makes it half as large
-    again.
+    """Return, for each number at the top of a module, the mutations that make it half as large
+    again and smaller by as much.
 
-    Left out are zeros, and modules that no test file names.
+    Left out are zeros, and modules that no test file reaches.
 
     Args:
         root: the checkout.
         words: only of files whose name contains one; none: of all.
     """
-    listed = {mutation.file: mutation.tests for mutation in MUTATIONS}
-    texts = {
-        path.relative_to(root).as_posix(): path.read_text(encoding="utf-8")
-        for path in sorted((root / "tests").rglob("test_*.py"))
-    }
+    tests_of = _TestsOf(root)
     out = list[Mutation]()
     for module, path in source_files(root).items():
         file = path.relative_to(root).as_posix()
         if words and not any(word in file for word in words):
             continue
-        package, _, name = module.rpartition(".")
-        imported = re.compile(
-            rf"{re.escape(module)}\b|from {re.escape(package)} import [^()\n]*\b{name}\b"
-        )
-        naming = (test for test, text in texts.items() if imported.search(text))
-        tests = tuple(dict.fromkeys((*listed.get(file, ()), *naming)))
-        text = path.read_text(encoding="utf-8")
+        tests = tests_of(module, file)
         if tests:
             out += [
-                Mutation(f"{module} {name} times 1.5", file, old, new, tests)
-                for name, old, new in _larger(text)
+                Mutation(f"{module} {name} {change}", file, old, new, tests)
+                for name, change, old, new in _scaled(path.read_text(encoding="utf-8"))
             ]
     return out
 
 
-def _larger(text: str) -> Iterator[tuple[str, str, str]]:
-    """Yield name, old and new text of each constant of a module, from the end of the line
-    before: numbers at its top, and those of records that are made there as they are declared.
+class _TestsOf:
+    """The test files of the mechanism that a module is part of."""
+
+    def __init__(self, root: Path) -> None:
+        self._listed = {mutation.file: mutation.tests for mutation in MUTATIONS}
+        self._texts = {
+            path.relative_to(root).as_posix(): path.read_text(encoding="utf-8")
+            for path in sorted((root / "tests").rglob("test_*.py"))
+        }
+        self._users: dict[str, list[str]] = {}
+        for user, used in read_edges(root):
+            self._users.setdefault(used, []).append(user)
+
+    def __call__(self, module: str, file: str) -> tuple[str, ...]:
+        """Those of the list for its file, and those that name it; where none does, those that
+        name a module that imports it. Tests of the whole project name modules for other reasons.
+        """
+        listed = self._listed.get(file, ())
+        own = self._naming(module)
+        of_users = [name for user in self._users.get(module, []) for name in self._naming(user)]
+        of_mechanism = [
+            [name for name in names if not name.startswith("tests/project/")]
+            for names in (own, of_users)
+        ]
+        names = next(filter(None, of_mechanism), [] if listed else own)
+        return tuple(dict.fromkeys((*listed, *names)))
+
+    def _naming(self, module: str) -> list[str]:
+        """Those of the folder of its name, where there are any, are of its mechanism; others only
+        use it.
+        """
+        package, _, name = module.rpartition(".")
+        imported = re.compile(
+            rf"{re.escape(module)}\b|from {re.escape(package)} import [^()\n]*\b{name}\b"
+        )
+        naming = [test for test, text in self._texts.items() if imported.search(text)]
+        folder = f"tests/{module.split('.')[1]}/" if package else ""
+        return [test for test in naming if test.startswith(folder)] or naming
+
+
+def draw_constants(
+    found: Sequence[Mutation], root: Path, count: int, seed: int
+) -> Iterator[Mutation]:
+    """Yield both mutations of some constants, drawn from each part by its share of them all."""
+    part_of_file = {
+        path.relative_to(root).as_posix(): part_of(module)
+        for module, path in source_files(root).items()
+    }
+    strata: dict[str, dict[tuple[str, str], list[Mutation]]] = {part: {} for part in PARTS}
+    for mutation in found:
+        constant = mutation.file, mutation.old
+        strata[part_of_file[mutation.file]].setdefault(constant, []).append(mutation)
+    chance = random.Random(seed)
+    total = sum(map(len, strata.values()))
+    drawn = before = 0
+    for constants in strata.values():
+        before += len(constants)
+        until = round(min(count, total) * before / max(1, total))
+        for both in chance.sample(list(constants.values()), until - drawn):
+            yield from both
+        drawn = until
+
+
+def _scaled(text: str) -> Iterator[tuple[str, str, str, str]]:
+    """Yield name, change, old and new text of each constant of a module and change, from the end
+    of the line before: numbers at its top, and those of records that are made there as they are
+    declared.
     """
     tree = ast.parse(text)
+    lines = text.split("\n")
     numbers = set(number_constants(tree))
     made = {
         node.value.func.id
@@ -152,20 +208,27 @@ def _larger(text: str) -> Iterator[tuple[str, str, str]]:
         if not isinstance(target, ast.Name) or target.id not in numbers or not (old and value):
             continue
         number = eval(compile(ast.Expression(node.value), "", "eval"), {})  # of numbers alone
-        larger = _half_more(number)
-        if larger != number:
-            indent = "\n" + " " * node.col_offset
-            before, _, after = old.rpartition(value)  # which may be in brackets
-            yield target.id, f"{indent}{old}", f"{indent}{before}{larger!r}{after}"
+        old = f"\n{' ' * node.col_offset}{old}"
+        first = node.lineno - 1
+        while text.count(old) > 1:  # another record has the same line
+            first -= 1
+            old = f"\n{lines[first]}{old}"
+        before, _, after = old.rpartition(value)  # which may be in brackets
+        for change, factor in (("times 1.5", 1.5), ("over 1.5", 1 / 1.5)):
+            other = _times(number, factor)
+            if other != number:
+                yield target.id, change, old, f"{before}{other!r}{after}"
 
 
-def _half_more(number: Any) -> Any:
-    """Return a number, or each of a tuple, half as large again."""
+def _times(number: Any, factor: float) -> Any:
+    """Return a number, or each of a tuple, times a factor; whole numbers change by one at least."""
     if isinstance(number, tuple):
-        return tuple(map(_half_more, number))
+        return tuple(_times(each, factor) for each in number)
     if isinstance(number, int):
-        return number + (max(1, abs(number) // 2) if number > 0 else -(abs(number) // 2))
-    return 1.5 * number
+        step = max(1, round(abs(number) * abs(factor - 1.0)))
+        step = step if factor > 1.0 else -step
+        return 0 if number == 0 else number + (step if number > 0 else -step)
+    return factor * number
 
 
 def mutated(mutation: Mutation, text: str) -> str:
@@ -208,22 +271,30 @@ def run_tests(copy: Path, tests: Sequence[str], *options: str) -> tuple[list[str
         MutationError: the copy is not what is imported, or pytest could not run.
     """
     data = os.environ.get("VIO_DATA") or str(ROOT.parent / "shared" / "data")
-    environment = {**os.environ, "PYTHONPATH": str(copy), "VIO_DATA": data}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(copy),
+        "VIO_DATA": data,
+        "VIO_TEST_MACHINE_CODE": "1",  # what a mutation changes is compiled anew
+    }
     # The process that tests says which packages it would test.
     code = (
         "import pytest, sys, vio, vio.frontend; print(vio.__file__, vio.frontend.__file__); "
         f"sys.exit(pytest.main({[*_PYTEST, *options, *tests]!r}))"
     )
     begin = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=copy,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=_MAX_S,
-    )
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=copy,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=_MAX_S,
+        )
+    except subprocess.TimeoutExpired:
+        return ["tests/that do not end"], _MAX_S
     seconds = time.perf_counter() - begin
     imported = done.stdout.partition("\n")[0].split()
     if len(imported) != 2 or not all(Path(file).is_relative_to(copy) for file in imported):
@@ -263,7 +334,7 @@ def main() -> int:
         ]
     else:
         found = constant_mutations(ROOT, args.words)
-        chosen = random.Random(args.seed).sample(found, min(args.constants, len(found)))
+        chosen = list(draw_constants(found, ROOT, args.constants, args.seed))
     if not chosen:
         parser.error("no mutation has such a name or file; see --list")
     if args.list:
@@ -287,7 +358,7 @@ def _run(chosen: Sequence[Mutation]) -> int:
             file = copy / mutation.file
             file.write_text(mutated(mutation, file.read_text(encoding="utf-8")), encoding="utf-8")
             failed, seconds = run_tests(copy, mutation.tests, "-x")
-        detected.update(failed)
+        detected.update(name for name in failed if "::" in name)
         if not failed:
             survivors.append(mutation.name)
         by = f"`{failed[0].removeprefix('tests/')}`" if failed else "**nothing**"

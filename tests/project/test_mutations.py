@@ -15,6 +15,7 @@ from tools.mutate import (
     Mutation,
     MutationError,
     constant_mutations,
+    draw_constants,
     mutated,
     read_mutations,
     run_tests,
@@ -64,7 +65,7 @@ def test_another_package_than_the_copy_is_an_error(tmp_path: Path) -> None:
         run_tests(tmp_path, ["tests/geometry/test_lie.py"])
 
 
-def test_constants_are_made_half_as_large_again(tmp_path: Path) -> None:
+def test_constants_are_made_larger_and_smaller(tmp_path: Path) -> None:
     (tmp_path / "vio").mkdir()
     (tmp_path / "tests").mkdir()
     text = """\"\"\"A module.\"\"\"
@@ -89,23 +90,63 @@ class _Other(NamedTuple):
     given: int = 1
 
 
+class _Alike(NamedTuple):
+    share: float = 0.25
+
+
 _RULES = _Rules()
+_ALIKE = _Alike()
 """
     (tmp_path / "vio" / "part.py").write_text(text)
     (tmp_path / "vio" / "unnamed.py").write_text("_A = 1\n")
+    (tmp_path / "vio" / "used.py").write_text("_B = 3\n")
+    (tmp_path / "vio" / "user.py").write_text("from vio import used\n")
     (tmp_path / "tests" / "test_part.py").write_text("from vio import part\n")
     (tmp_path / "tests" / "test_other.py").write_text("import vio.partner\n")
-    found = constant_mutations(tmp_path)
-    assert [(m.old, m.new) for m in found] == [
-        ("\n_ONE = 1", "\n_ONE = 2"),
-        ("\n_SHARE: float = 0.5", "\n_SHARE: float = 0.75"),
-        ("\n_PAIR = (-4, 2.0)", "\n_PAIR = (-6, 3.0)"),
-        ("\n_GRID = ((1, 2), (3, 4))", "\n_GRID = ((2, 3), (4, 6))"),
-        ("\n_LONG = (\n    # why\n    2.0\n)", "\n_LONG = (\n    # why\n    3.0\n)"),
-        ("\n    share: float = 0.25", "\n    share: float = 0.375"),
+    (tmp_path / "tests" / "test_user.py").write_text("import vio.user\n")
+    of_file = {"vio/part.py": list[Mutation](), "vio/used.py": list[Mutation]()}
+    for mutation in constant_mutations(tmp_path):
+        of_file[mutation.file].append(mutation)
+    found = of_file["vio/part.py"]
+    old = [mutation.old.lstrip() for mutation in found]
+    assert old == sorted(old, key=text.index)  # both changes of each, in the file's order
+    changed = ["".join(set(mutation.new.split("\n")) - set(text.split("\n"))) for mutation in found]
+    assert changed == [
+        "_ONE = 2",
+        "_ONE = 0",
+        "_SHARE: float = 0.75",
+        "_SHARE: float = 0.3333333333333333",
+        "_PAIR = (-6, 3.0)",
+        "_PAIR = (-3, 1.3333333333333333)",
+        "_GRID = ((2, 3), (5, 6))",
+        "_GRID = ((0, 1), (2, 3))",
+        "    3.0",
+        "    1.3333333333333333",
+        "    share: float = 0.375",
+        "    share: float = 0.16666666666666666",
+        "    share: float = 0.375",
+        "    share: float = 0.16666666666666666",
     ]
     assert {m.tests for m in found} == {("tests/test_part.py",)}
-    assert "_PAIR = (-6, 3.0)\n_GRID" in mutated(found[2], text)
+    assert "_PAIR = (-6, 3.0)\n_GRID" in mutated(found[4], text)
+    # no test names it; one names the module that imports it
+    assert {m.tests for m in of_file["vio/used.py"]} == {("tests/test_user.py",)}
+
+
+def test_constants_are_drawn_from_each_part(tmp_path: Path) -> None:
+    for package, count in {"vio/filters": 6, "vio/bench": 3}.items():
+        folder = tmp_path / package
+        folder.mkdir(parents=True)
+        text = "".join(f"_N{k} = {k + 2}.0\n" for k in range(count))
+        (folder / "part.py").write_text(text)
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_all.py").write_text("from vio.filters import part\nvio.bench.part")
+    found = constant_mutations(tmp_path)
+    drawn = list(draw_constants(found, tmp_path, 3, seed=1))
+    assert [m.file for m in drawn] == ["vio/filters/part.py"] * 4 + ["vio/bench/part.py"] * 2
+    assert len({m.old for m in drawn}) == 3  # each times and over 1.5
+    assert drawn == list(draw_constants(found, tmp_path, 3, seed=1))
+    assert len(list(draw_constants(found, tmp_path, 99, seed=1))) == 18
 
 
 def test_constants_of_this_checkout_can_be_changed() -> None:
