@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,7 +17,7 @@ from tests.guards import guarded_klt, lines_of
 from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.guard.exchange import ExchangeDetector, MatchCounts
 from vio.guard.probe import RowProbe
-from vio.records import FrontendOutput
+from vio.records import FrontendOutput, Image
 
 SETTINGS = FrontendSettings(grid=GridSettings(target_features=150))
 IN_ORDER, SWAPPED, CROOKED = MatchCounts(80, 70, 3), MatchCounts(80, 20, 75), MatchCounts(80, 4, 25)
@@ -82,3 +83,29 @@ def test_front_end_gives_the_same_output_to_the_bit_where_two_frames_are_exchang
         np.testing.assert_array_equal(found.observations.ids, expected.observations.ids)
         np.testing.assert_array_equal(found.observations.z, expected.observations.z)
         assert bool(found.findings) == (found.observations.frame_index in (2, 4))
+
+
+def _far_pair(disparity_px: int) -> tuple[Image, Image]:
+    """Left and right images of a smooth wall that is far away."""
+    noise = np.random.default_rng(0).uniform(0.0, 255.0, (120, 301))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 3.0)
+    wall = np.asarray(
+        cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX, dtype=cv2.CV_8U), dtype=np.uint8
+    )
+    left = np.ascontiguousarray(wall[:, 10:290])
+    return left, np.ascontiguousarray(wall[:, 10 + disparity_px : 290 + disparity_px])
+
+
+@pytest.mark.parametrize("disparity_px", [1, 2])
+def test_small_disparities_have_one_sign(disparity_px: int) -> None:
+    """Of a far scene, patches match almost as well with no disparity at all: in an image rendered
+    along MH_03, two seconds of exchanged images were used for that (47 sigma).
+    """
+    probe = RowProbe()
+    left, right = _far_pair(disparity_px)
+    points = probe.corners(right)
+    exchanged = MatchCounts(
+        len(points), probe.positive(right, left, points), probe.negative(right, left, points)
+    )
+    assert exchanged.negative > 2 * exchanged.positive
+    assert probe.positive(left, right, points) > 2 * probe.negative(left, right, points)

@@ -26,7 +26,8 @@ class _ProbeRules:
     min_correlation: float = 0.8
     good_correlation: float = 0.9  # of patches whose rows agree
     min_margin: float = 0.03  # lead over the second-best match of a row
-    min_negative_px: float = 1.0  # of a disparity that counts as negative
+    # of a disparity that has a sign: next to zero, the search to the wrong side matches as well
+    min_signed_px: float = 1.0
     max_rows_half: int = 16  # row difference that is searched, pixels at half resolution
     clearly: int = 2  # times as many matches at another row difference
 
@@ -58,22 +59,20 @@ class RowProbe:
 
     def positive(self, left: Image, right: Image, points: FloatArray) -> int:
         """Count the pixels (N, 2) of the left image that match with a positive disparity."""
-        found = self._count(left, right, points, self._rows, _RULES.min_correlation)
+        found = self._positive(left, right, points)
         if found < _FEW * len(points) and not self._searched:
             self._search(left, right, points)
-            found = self._count(left, right, points, self._rows, _RULES.min_correlation)
+            found = self._positive(left, right, points)
         return found
+
+    def _positive(self, left: Image, right: Image, points: FloatArray) -> int:
+        return _signed(left, shifted_rows(right, self._rows), points)
 
     def negative(self, left: Image, right: Image, points: FloatArray) -> int:
         """Count the pixels (N, 2) of the left image that match with a negative disparity."""
         mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (left, right)]
         flipped = points * [-1.0, 1.0] + [2.0 * (left.shape[1] - 1), 0.0]
-        rows = shifted_rows(mirrored[1], self._rows)
-        reach = _RULES.max_disparity * 2 * left.shape[1]
-        disparity, good = match_rows(
-            mirrored[0], rows, flipped, reach, _RULES.min_correlation, _RULES.min_margin
-        )
-        return int((good & (disparity >= _RULES.min_negative_px)).sum())
+        return _signed(mirrored[0], shifted_rows(mirrored[1], self._rows), flipped)
 
     def on_rows(self, left: Image, right: Image, points: FloatArray) -> int:
         """Count the pixels (N, 2) of the left image that match well on their rows.
@@ -106,22 +105,36 @@ class RowProbe:
             ].sum()
         )
 
-    def _count(
-        self, left: Image, right: Image, points: FloatArray, rows: int, correlation: float
-    ) -> int:
-        reach = _RULES.max_disparity * 2 * left.shape[1]
-        other = shifted_rows(right, rows)
-        return int(match_rows(left, other, points, reach, correlation, _RULES.min_margin)[1].sum())
-
     def _search(self, left: Image, right: Image, points: FloatArray) -> None:
         """Take the row difference at which most pixels match well, where it is a clear one."""
         self._searched = True
         tried = range(-_RULES.max_rows_half, _RULES.max_rows_half + 1)
-        counts = [self._count(left, right, points, rows, _RULES.good_correlation) for rows in tried]
+        reach = _RULES.max_disparity * 2 * left.shape[1]
+        found = [
+            match_rows(
+                left,
+                shifted_rows(right, rows),
+                points,
+                reach,
+                _RULES.good_correlation,
+                _RULES.min_margin,
+            )[1]
+            for rows in tried
+        ]
+        counts = [int(good.sum()) for good in found]
         best = int(np.argmax(counts))
         present = counts[self._rows + _RULES.max_rows_half]
         if counts[best] >= max(_FEW * len(points), _RULES.clearly * present):
             self._rows = tried[best]
+
+
+def _signed(left: Image, right: Image, points: FloatArray) -> int:
+    """Count the pixels (N, 2) of the left image that match clearly left of themselves."""
+    reach = _RULES.max_disparity * 2 * left.shape[1]
+    disparity, good = match_rows(
+        left, right, points, reach, _RULES.min_correlation, _RULES.min_margin
+    )
+    return int((good & (disparity >= _RULES.min_signed_px)).sum())
 
 
 def _between_rows(image: Image, rows: float) -> Image:
