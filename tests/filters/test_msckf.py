@@ -590,7 +590,7 @@ def test_frames_without_features_grow_the_covariance_by_the_motion_model(
     flight, settings = Flight(frames=6), replace(EXACT_RIG, calibrate_camera_imu="none")
     _, _, filt = flight.run(settings, motion)
     window, noise = filt._window, np.random.default_rng(1)
-    P = filt._propagation.posterior.own.copy()
+    P = filt._propagation.reported.own.copy()
     samples = flight.imu(noise, np.zeros(6)) if motion == "imu" else []
     other = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
     for sample in samples:

@@ -614,7 +614,9 @@ class FrameUpdate:
         if considered is not None:
             V = V - P @ (A[:size, :size] @ V + considered[:size])
         reported = P + self._rig.reported_uncertainty(window, V)
-        reported += (self._overdispersion.outlasting - 1.0) * given(P, window.state.stereo)
+        # biases and calibration have priors of their own, which errors of pixels do not widen
+        constants = slice(window.motion.biases.start, window.state.own.stop)
+        reported += (self._overdispersion.outlasting - 1.0) * given(P, constants)
         self._propagation.posterior = FramePosterior.of(window, P)
         self._propagation.reported = FramePosterior.of(window, reported)
         self.smoothed = WindowPosterior.of(window, P, reported)

@@ -160,6 +160,8 @@ class Measurement:
 class ImuMotion:
     """Gyro and accelerometer, gravity, two biases that walk."""
 
+    biases = slice(9, DIM)  # rows of the navigation error
+
     def __init__(self, settings: MsckfSettings, imu: ImuSettings = DEFAULT_IMU) -> None:
         self._imu = imu
         self._chosen = CHOSEN[settings.calibrate_imu]  # the IMU's terms that are estimated
@@ -459,6 +461,8 @@ class TwistMotion:
     This is `vio.filters.vislam_motion.DriftingTwist` with the error on the world side and a bias of
     the angular rate.
     """
+
+    biases = slice(12, DIM)  # that of the measured rate
 
     def __init__(self, settings: MsckfSettings) -> None:
         s = self._settings = settings

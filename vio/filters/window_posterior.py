@@ -18,6 +18,8 @@ from vio.geometry.relative_pose import RelativePose
 from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import Estimate
 
+# of the largest eigenvalue of a correlation: less is rounding
+_GIVEN_RANK = 1e-10
 _MIN_MOTION_M = 1e-3  # of all poses from the oldest one: less has no scale
 _STATIONARY_LIMIT = float(chi_square_quantile(0.95, 6))  # of the motion over the window
 
@@ -160,10 +162,15 @@ def given(P: FloatArray, rows: slice) -> FloatArray:
     """Covariance (k, k) of errors of covariance P (k, k) where those of `rows` are known, which
     have none there.
     """
-    if rows.start == rows.stop:
-        return P
-    half = np.linalg.solve(np.linalg.cholesky(P[rows, rows]), P[rows])
+    known = P[rows, rows]
+    scale = np.sqrt(known.diagonal())
+    scale[scale == 0] = np.inf  # known already
+    values, vectors = np.linalg.eigh(known / np.outer(scale, scale))
+    independent = values > _GIVEN_RANK
+    half = (vectors[:, independent] / np.sqrt(values[independent])).T @ (P[rows] / scale[:, None])
     out: FloatArray = P - half.T @ half
+    out[rows] = 0.0
+    out[:, rows] = 0.0
     return out
 
 
