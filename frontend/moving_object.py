@@ -80,7 +80,8 @@ _AGREEMENT = _AgreementRules()
 class _VoteRules(NamedTuple):
     """How points that were static for long vote."""
 
-    # errors of points of the scene over the median of those that are static for long: of 1000 one more
+    # errors of points of the scene over the median of those that are static for long: of 1000 one
+    # more
     following_ratio: float = 3.2
     voters: int = 50  # how many points vote, and for how many frames each must have been static
     static_frames: int = 5

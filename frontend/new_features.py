@@ -1,5 +1,5 @@
-"""New features: which corners become features, and where the right image shows features without
-a match.
+"""New features: how many corners are detected, which of them become features and are output, and
+where the right image shows features without a match.
 """
 
 from __future__ import annotations
@@ -10,13 +10,16 @@ import numpy as np
 
 from vio.frontend.align import rounded
 from vio.frontend.columns import changed, joined, take
+from vio.frontend.detect import detect_corners
+from vio.frontend.frame_images import FrameImages
 from vio.frontend.outliers import Consensus
 from vio.frontend.patches import ImageLevels, inside
+from vio.frontend.right_images import RightImages
 from vio.frontend.settings import GridSettings
-from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import AnchorBank, Tracks, new_tracks
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
+from vio.protocols import Detector
 from vio.records import BoolArray, Image, IntArray
 
 
@@ -30,57 +33,106 @@ class _NewRules(NamedTuple):
     # share of the least number of features below which corners without depth are added
     few_share: float = 0.5
     tried_factor: float = 1.5  # corners aligned per missing feature
+    # extra corners tried, over the number of missing features; the best stereo matches are kept
+    spare_corners: float = 1.5
+    # share of the features; detection takes more time than it is worth for fewer
+    few_missing_share: float = 0.1
+
+
+class _OutputRules(NamedTuple):
+    """When new features are output."""
+
+    # for which a new corner must be tracked, in time and stereo, before it is output
+    probation_frames: int = 1
+    very_few_share: float = 0.25  # share of the target below which new features are output at once
 
 
 _NEW = _NewRules()
+_OUTPUT = _OutputRules()
 
 
 class NewFeatures:
-    """Search right matches for new corners and for features without one; add the best new
-    corners.
+    """Detect corners, search right matches for them and for features without one, and add the best
+    corners as new features.
     """
 
-    def __init__(self, camera: StereoCamera, grid: GridSettings, bank: AnchorBank) -> None:
-        """Prepare; the bank receives the new features' anchors."""
+    def __init__(
+        self,
+        camera: StereoCamera,
+        grid: GridSettings,
+        bank: AnchorBank,
+        right: RightImages,
+        detector: Detector | None = None,
+    ) -> None:
+        """Prepare; the bank receives the new features' anchors.
+
+        `right` says whether right images may be used, and a `detector` finds corners in place of
+        the built-in one.
+        """
         self._camera = camera
         self._grid = grid
         self._bank = bank
+        self._right = right
+        self._detector = detector
+        self._next_id = 0
+        self._rested = False  # whether the last frame was one in which no corners were detected
+
+    def detect(self, images: FrameImages, tracks: Tracks) -> FloatArray:
+        """Return corners (K, 2) for new features beside those of a frame, best first."""
+        wanted = self._wanted_corners(len(tracks))
+        left = images.left
+        occupied = tracks.left
+        if self._detector is None:
+            return detect_corners(left.half, occupied, wanted, self._grid, images.allowed)
+        from vio.frontend.given_corners import given_corners
+
+        return given_corners(
+            self._detector, left.full, occupied, wanted, self._grid, images.allowed
+        )
+
+    def _wanted_corners(self, active: int) -> int:
+        """Number of corners to detect beside active features; none in every other frame while
+        few are missing.
+        """
+        target = self._grid.target_features
+        missing = target - active
+        self._rested = not self._rested and missing <= _NEW.few_missing_share * target
+        return 0 if self._rested else round(missing * (1.0 + _NEW.spare_corners))
 
     def add(
         self,
-        left: ImageLevels,
-        right: ImageLevels | None,
+        images: FrameImages,
         tracks: Tracks,
         corners: FloatArray,
         motion: Consensus | None,
-        stereo: StereoFit,
-        *,
-        delayed: bool,
     ) -> Tracks:
-        """Return the features with right matches where they lacked one, and with new features at
-        corners (K, 2).
+        """Return the features of a frame with right matches where they lacked one, and with new
+        features at corners (K, 2).
+
+        While right images are of another time, a corner is matched once two frames have seen it.
 
         Args:
-            left: left image.
-            right: right image; None: it cannot be used.
-            tracks: features of this frame.
+            images: of this frame.
+            tracks: its features.
             corners: left pixels, best first.
             motion: consensus motion since the previous frame, if there is one.
-            stereo: the matcher.
-            delayed: whether the right image is of another time: a corner is matched once two frames
-                have seen it.
         """
+        right = images.right if self._right.usable else None
+        # Without a second camera no corner is searched along the row either: all are taken without
+        # a depth.
+        delayed = images.right is None or self._right.delayed
+        left = images.left.full
         tracks, disparity_new, unique = self._search_right(
-            left, right, tracks, corners, motion, stereo, delayed
+            images, right, tracks, corners, motion, delayed
         )
         if not len(corners):
             return tracks
-        stays = self._stay_visible(corners, disparity_new, motion, left.full)
+        stays = self._stay_visible(corners, disparity_new, motion, left)
         chosen, with_depth = self._select_corners(tracks, unique, stays, delayed)
         centres = rounded(corners[chosen])
-        new = new_tracks(centres, self._bank.add(left.full, centres))
+        new = new_tracks(centres, self._bank.add(left, centres))
         if right is not None:
-            new = stereo.match_near(
+            new = images.stereo.match_near(
                 new, right, np.arange(with_depth), disparity_new[chosen[:with_depth]]
             )
         new = changed(new, left_only_frames=np.where(new.has_right, 0, 1))
@@ -88,17 +140,31 @@ class NewFeatures:
         good = (new.has_right | (len(chosen) > with_depth)).nonzero()[0]
         return joined(tracks, take(new, good[(~new.has_right[good]).argsort(kind="stable")][:room]))
 
+    def output(self, tracks: Tracks) -> Tracks:
+        """Output features that passed their probation from now on, under new ids; all features
+        if these are few.
+        """
+        proven = tracks.has_right | (not self._right.needed)
+        proven = tracks.shown | ((tracks.age >= _OUTPUT.probation_frames) & proven)
+        if proven.sum() < _OUTPUT.very_few_share * self._grid.target_features:
+            proven[:] = True
+        ids = tracks.ids.copy()
+        first = proven & ~tracks.shown
+        ids[first] = np.arange(int(first.sum())) + self._next_id
+        self._next_id += int(first.sum())
+        return changed(tracks, ids=ids, shown=proven)
+
     def _search_right(
         self,
-        left: ImageLevels,
+        images: FrameImages,
         right: ImageLevels | None,
         tracks: Tracks,
         corners: FloatArray,
         motion: Consensus | None,
-        stereo: StereoFit,
         delayed: bool,
     ) -> tuple[Tracks, FloatArray, BoolArray]:
-        """Search features without a right match and corners (K, 2) along the row.
+        """Search features without a right match and corners (K, 2) along the row of the right
+        image.
 
         Returns:
             The features, without those that had no match for too long; disparities (K,) of the
@@ -118,8 +184,9 @@ class NewFeatures:
         rows = unmatched.nonzero()[0]
         if not len(rows) + len(corners):
             return self._without_old_left_only(tracks), *nothing
+        stereo = images.stereo
         disparity, unique = stereo.search(
-            left.half, right.half, np.concatenate([tracks.left[rows], corners])
+            images.left.half, right.half, np.concatenate([tracks.left[rows], corners])
         )
         old = len(rows)
         known = unique[: len(rows)]

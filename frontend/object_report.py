@@ -19,7 +19,8 @@ class _EventRules(NamedTuple):
     """When an object is an event that is reported, and when it hides the scene."""
 
     frames: int = 5  # in a row before an object is reported …
-    # … or so many of the last ones, where a decision was made: a slow one is seen in some of them only
+    # … or so many of the last ones, where a decision was made: a slow one is seen in some of them
+    # only
     recent_frames: int = 15
     known_frames: int = 2  # in a row before an object is known, and may hide the scene
     # of the points that the scene has, during an event, below which the object hides it …

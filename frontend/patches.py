@@ -22,6 +22,10 @@ class ImageLevels:
     full: Image  # (H, W)
     half: Image  # (H/2, W/2) by `half_image`
 
+    def kept(self) -> ImageLevels:
+        """The image with pixels of its own: a reader may reuse its buffer."""
+        return ImageLevels(self.full.copy(), self.half)
+
 
 def half_image(image: Image) -> Image:
     """The image at half resolution; pixel (u, v) of the full image is at (u/2, v/2) there."""

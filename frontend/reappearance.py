@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.frontend.columns import share_of
+from vio.frontend.frame_images import FrameImages
 from vio.frontend.outliers import RansacProblem, best_motion
 from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import MatchSettings
@@ -22,7 +23,7 @@ from vio.frontend.tracks import PreviousFrame
 from vio.geometry.lie import FloatArray, so3_log, transform_points
 from vio.geometry.stereo import depth_of, left_rays
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import MotionPrior
+from vio.records import MotionPrior, TrackPrior
 
 
 class _ReappearanceRules(NamedTuple):
@@ -38,6 +39,52 @@ class _ReappearanceRules(NamedTuple):
 
 
 _AGAIN = _ReappearanceRules()
+
+
+class _LongGapRules(NamedTuple):
+    """When tracks are not followed over a gap."""
+
+    min_s: float = 0.8  # a rig that flies or is carried shows other things after it …
+    min_steps: float = 5.0  # … where frames usually come so many times as often
+
+
+_LONG_GAP = _LongGapRules()
+
+
+def is_long_gap(gap_ns: int, step_ns: int) -> bool:
+    """Whether so many frames are missing that similar patches are no evidence of the same points.
+
+    Args:
+        gap_ns: time since the last frame.
+        step_ns: time between that one and the one before it.
+    """
+    return gap_ns > max(_LONG_GAP.min_s * 1e9, _LONG_GAP.min_steps * step_ns)
+
+
+def motion_after_gap(
+    problem: RansacProblem,
+    images: FrameImages,
+    previous: PreviousFrame,
+    expected: FloatArray,
+    prior: TrackPrior | None,
+) -> FloatArray | None:
+    """Return the camera's motion (4, 4) `T_curr_prev` since the last good pair, by key points of
+    both pairs; None: none is proved.
+
+    A facade repeats itself at the same depth; a gyro that contradicts tells.
+
+    Args:
+        problem: camera, inlier threshold for key points, and random generator.
+        images: of this frame.
+        previous: the last good pair.
+        expected: motion (4, 4) by the last one.
+        prior: usable prior, or None.
+    """
+    if images.right is None or previous.right_half is None:
+        return None
+    starts = np.stack([expected, np.eye(4)])
+    T = motion_across(problem, images.stereo, previous, images.left, images.right, starts)
+    return None if T is None or (prior is not None and contradicts_gyro(T, prior.motion)) else T
 
 
 def contradicts_gyro(T_curr_prev: FloatArray, predicted: MotionPrior | None) -> bool:

@@ -19,12 +19,13 @@ from vio.dataclass import dataclass
 from vio.frontend.align import align, on_peak
 from vio.frontend.columns import take
 from vio.frontend.flow import track_with_retries
+from vio.frontend.frame_images import FrameImages
 from vio.frontend.one_camera import with_prior_depths
 from vio.frontend.outliers import RansacProblem, pixel_errors, rigid_consensus
 from vio.frontend.patches import ImageLevels
 from vio.frontend.prediction import moved_pixels
 from vio.frontend.stereo_fit import StereoFit
-from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks
+from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import (
     FloatArray,
     se3_exp,
@@ -46,6 +47,46 @@ class _AloneRules(NamedTuple):
 
 
 _ALONE = _AloneRules()
+
+
+class RightFollower:
+    """Follows the features of the last good pair while the left camera is frozen."""
+
+    def __init__(self, bank: AnchorBank, levels: int) -> None:
+        """Prepare; the bank has the features' anchors, and `levels` are those of tracking."""
+        self._bank = bank
+        self._levels = levels
+        self._alone: RightAlone | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether the last frame was followed so."""
+        return self._alone is not None
+
+    def end(self) -> None:
+        """Begin anew with the next pair."""
+        self._alone = None
+
+    def follow(
+        self,
+        images: FrameImages,
+        previous: PreviousFrame,
+        problem: RansacProblem,
+        prior: TrackPrior | None,
+    ) -> Tracks:
+        """Return the features of the last good pair by the right image of a frame, at left
+        pixels.
+        """
+        if images.right is None:
+            return no_tracks()
+        last = self._alone or RightAlone.after(problem.camera, previous)
+        alone = last.next(
+            images.frame.time_ns, problem, self._bank, images.right, prior, self._levels
+        )
+        if alone is None:
+            return no_tracks()
+        self._alone = alone
+        return alone.in_left(problem.camera, images.stereo)
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,7 +40,8 @@ class _DelayRules(NamedTuple):
     # standard deviations of the delay: errors of a feature's rows last for as long as the feature
     min_sigmas: float = 10.0
     row_sigma_px: float = 0.5  # of the rows, beyond which a match counts less (Cauchy)
-    # a delay this near to whole frames is one of whole frames: an image was paired with the wrong one
+    # a delay this near to whole frames is one of whole frames: an image was paired with the wrong
+    # one
     whole_slack_frames: float = 0.15
     forget_frames: float = 0.1  # delay below which the images are taken to be simultaneous again
 

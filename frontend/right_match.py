@@ -6,31 +6,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.dataclass import dataclass
-from vio.frontend.one_camera import with_prior_depths
+from vio.findings import Finding
+from vio.frontend.frame_images import FrameImages
+from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import Consensus
 from vio.frontend.patches import ImageLevels
-from vio.frontend.right_camera import RightCamera
-from vio.frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
+from vio.frontend.right_delay import PairingCounts, at_exposure, at_present
+from vio.frontend.right_images import RightImages
 from vio.frontend.right_turn import PairShake, RightTurn
 from vio.frontend.stereo_fit import StereoFit
-from vio.frontend.tracks import PreviousFrame, Tracks, no_tracks
+from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, IntArray, StereoFrame, TrackPrior
+from vio.records import BoolArray, IntArray, SigmaArray, TrackPrior
 
 _NEARLY_ALL = 0.9  # of the matches without an offset, that one with it may have
 _PAIRING_POINTS = 150  # features that are tried with images of other frames
-
-
-@dataclass(frozen=True, slots=True)
-class FrameImages:
-    """The images of a frame in the forms that tracking needs."""
-
-    frame: StereoFrame
-    left: ImageLevels
-    right: ImageLevels | None  # None: one camera
-    stereo: StereoFit
 
 
 class RightMatcher:
@@ -38,20 +29,37 @@ class RightMatcher:
     be used.
     """
 
-    def __init__(self, camera: StereoCamera, right: RightCamera, delay: RightDelay) -> None:
-        """Prepare; what is known of the right camera and of its delay is updated with each
-        frame.
-        """
+    def __init__(self, camera: StereoCamera) -> None:
+        """Prepare; what is known of the right images is updated with each frame."""
         self._camera = camera
-        self._right = right
-        self._delay = delay
-        self.turn = RightTurn(camera.fu)
-        self.shake = PairShake(camera.fu)
+        self.images = RightImages(camera)
+        self._right = self.images.camera
+        self._delay = self.images.delay
+        self._turn = RightTurn(camera.fu)
+        self._shake = PairShake(camera.fu)
+
+    def take_findings(self) -> tuple[Finding, ...]:
+        """Return what was found since the last call."""
+        parts = (self.images, self._turn, self._shake)
+        return tuple(found for part in parts for found in part.take_findings())
+
+    def sigma(self, tracks: Tracks, bank: AnchorBank) -> SigmaArray:
+        """Standard deviations (N, 3) of features as in `Observations`, which cover what shakes the
+        right camera.
+        """
+        sigma = bank.sigma(tracks.slot, depth_image=self._camera.kind == "rgbd")
+        if self._shake.right_factor > 1.0:
+            sigma[:, 2] *= self._shake.right_factor
+        return sigma
+
+    def try_again(self, index: int, prior: TrackPrior | None) -> None:
+        """Take the right image anew where nothing is tracked, as it was not at fault perhaps."""
+        if prior is None or prior.measured_motion is None:
+            self._right.try_again(index)
 
     def match(
         self,
         images: FrameImages,
-        right: ImageLevels,
         previous: PreviousFrame,
         tracks: Tracks,
         prior: TrackPrior | None,
@@ -60,12 +68,14 @@ class RightMatcher:
         """Match features of known depth in the right image; no match where the right image cannot
         be used.
 
-        While it cannot, depths come from the prior, where it has them. `right` is the right image
-        of the frame.
+        While it cannot, or there is none, depths come from the prior, where it has them.
         """
         frame = images.frame
         left = images.left
+        right = images.right
         stereo = images.stereo
+        if right is None:
+            return with_prior_depths(self._camera, tracks, prior)
         if not self._right.usable:
             tracks = with_prior_depths(self._camera, tracks, prior)
         testable = stereo.testable(tracks)
@@ -78,7 +88,7 @@ class RightMatcher:
             matched = stereo.track_right(tracks, right, motion is not None)
             matched = self._take_turn(images, right, tracks, matched, testable, tested=tested)
         else:
-            self.shake.explained(frame.index)
+            self._shake.explained(frame.index)
             T = _motion_between(prior, motion)
             matched = self._match_delayed(previous, tracks, right, flow, T, stereo)
         frame_s = (frame.time_ns - previous.time_ns) * 1e-9
@@ -97,6 +107,17 @@ class RightMatcher:
             return no_tracks()  # their depths are those of images of different times
         return matched
 
+    def complete(self, images: FrameImages, tracks: Tracks) -> Tracks:
+        """Return all features of a frame with the virtual matches that a depth image gives; learn
+        from true ones the rows in which right images show features.
+        """
+        if images.right is not None and self.images.of_present:
+            images.stereo.update_rows(tracks)
+        depth = images.frame.depth
+        if self._camera.kind == "rgbd" and depth is not None:
+            return with_depths(self._camera, tracks, depth)
+        return tracks
+
     def _take_turn(
         self,
         images: FrameImages,
@@ -114,18 +135,18 @@ class RightMatcher:
         stereo = images.stereo
         few = self._right.doubts(matched.has_right[testable])
         common_px = stereo.common_px
-        self.shake.frame(index, common_px, int(matched.has_right.sum()))
+        self._shake.frame(index, common_px, int(matched.has_right.sum()))
         # one that stays may be too small to lose matches by
-        if tested and (few or self.turn.may_stay or self.turn.is_jump(common_px)):
+        if tested and (few or self._turn.may_stay or self._turn.is_jump(common_px)):
             off = stereo.track_off_right(
                 tracks, images.left, right, by_motion=not self._right.usable
             )
             least = matched.has_right.sum() * (1.0 if few else _NEARLY_ALL)
-            if off.has_right.sum() > least and self.turn.is_offset(stereo.offset_px):
+            if off.has_right.sum() > least and self._turn.is_offset(stereo.offset_px):
                 matched = off
             else:
                 stereo.forget_offset()
-        turn_px = self.turn.frame(index, stereo.offset_px)
+        turn_px = self._turn.frame(index, stereo.offset_px)
         if turn_px is not None:
             stereo.take_out(turn_px)
         return matched

@@ -8,7 +8,7 @@ from vio.dataclass import dataclass
 from vio.frontend.align import INSIDE, cut_patches, empty_templates, replace_templates, shift_warps
 from vio.frontend.columns import joined
 from vio.frontend.patches import ImageLevels
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.records import BoolArray, Image, IntArray, SigmaArray
 
 ANCHOR_RADIUS_PX = 9  # of the anchor patch that a feature is aligned with
@@ -48,6 +48,14 @@ class PreviousFrame:
     tracks: Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
     trusted: bool  # the last motion had a consensus
+
+    def expected_motion(self, time_ns: int) -> FloatArray:
+        """The camera's motion (4, 4) `T_curr_prev` until a time, if it goes on as it was."""
+        return se3_exp(self.twist_per_s * ((time_ns - self.time_ns) * 1e-9))
+
+    def twist_until(self, time_ns: int, T_curr_prev: FloatArray) -> FloatArray:
+        """The twist (6,) per second of a motion (4, 4) from this frame until a time."""
+        return se3_log(T_curr_prev) / ((time_ns - self.time_ns) * 1e-9)
 
 
 def new_tracks(left: FloatArray, slot: IntArray) -> Tracks:

@@ -13,8 +13,8 @@ import numpy.typing as npt
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 
 # Every public function `*_D_*` of vio and frontend, as 'module.name'. Add a name here together with
-# the test that compares it with `numeric_jacobian`; tests/project/test_jacobian_registry.py holds this set
-# complete and honest.
+# the test that compares it with `numeric_jacobian`; tests/project/test_jacobian_registry.py holds
+# this set complete and honest.
 TESTED_JACOBIANS = {
     "vio.filters.imu_terms.accel_D_terms",
     "vio.filters.imu_terms.gyro_D_terms",

@@ -78,7 +78,7 @@ def test_a_flight_of_one_camera_is_the_same_recording_to_the_bit(
 
 
 # --- calibration
-# ----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def script_of(storage: str = "mcap", *, imu: bool = True, images: bool = True) -> Script:
@@ -198,7 +198,7 @@ def test_raw_and_compressed_images_of_one_camera_are_one_camera(
 
 
 # --- topics
-# ---------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_depth_images_beside_one_camera_leave_one(tmp_path: Path) -> None:
@@ -244,7 +244,7 @@ def test_the_left_camera_of_one_is_that_camera(tmp_path: Path) -> None:
 
 
 # --- stamps
-# ---------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_images_logged_late_come_in_the_order_of_their_stamps(

@@ -114,7 +114,7 @@ def test_without_the_laser_scanner_the_body_is_the_camera(tmp_path: Path) -> Non
 
 
 # --- clock
-# ----------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_times_follow_from_frame_numbers_where_there_are_none(tmp_path: Path) -> None:
@@ -145,7 +145,7 @@ def test_timestamps_are_read_to_the_nanosecond(lines: int, rows: list[int], tmp_
 
 
 # --- bad input
-# ------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 Corruption = Callable[[Path], object]
 

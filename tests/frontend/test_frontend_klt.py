@@ -23,7 +23,7 @@ from tests.frontend.test_frontend_scene import (
 )
 from tests.guards import guarded_klt, messages
 from vio.errors import ConfigError, DataError
-from vio.frontend import detect, flow, klt, new_features, one_opencv_thread, stereo_fit
+from vio.frontend import detect, flow, frame_images, new_features, one_opencv_thread, stereo_fit
 from vio.frontend.detect import cell_index, grid_shape, min_distance_px
 from vio.frontend.klt import KltFrontend
 from vio.frontend.outliers import _refine
@@ -503,7 +503,7 @@ def test_new_features_are_output_after_probation(monkeypatch: pytest.MonkeyPatch
     """A feature with a new id was detected at least one frame earlier."""
     settings = FrontendSettings(grid=GridSettings(target_features=300))
     held = run(FRAMES, settings)
-    monkeypatch.setattr(klt, "_NEW", klt._NEW._replace(probation_frames=0))
+    monkeypatch.setattr(new_features, "_OUTPUT", new_features._OUTPUT._replace(probation_frames=0))
     free = run(FRAMES, settings)
     late = [
         later.observations.ids[later.observations.ids > held[0].observations.ids.max()]
@@ -728,10 +728,10 @@ def test_only_doubtful_points_are_tracked_backward(monkeypatch: pytest.MonkeyPat
 def test_corners_are_detected_in_every_other_frame_while_few_are_missing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(klt, "_NEW", klt._NEW._replace(spare_corners=0.0))
-    frontend = KltFrontend(CAMERA, SETTINGS)
+    monkeypatch.setattr(new_features, "_NEW", new_features._NEW._replace(spare_corners=0.0))
+    features = KltFrontend(CAMERA, SETTINGS)._new_features
     few, many = GRID.target_features - 10, GRID.target_features // 2
-    assert [frontend._wanted_corners(active) for active in (few, few, few, many, many, few)] == [
+    assert [features._wanted_corners(active) for active in (few, few, few, many, many, few)] == [
         0,
         10,
         0,
@@ -758,7 +758,7 @@ def test_opencv_has_its_threads_back_after_a_run_that_failed() -> None:
 
 def test_each_image_is_halved_once(monkeypatch: pytest.MonkeyPatch) -> None:
     halved: list[object] = []
-    for module in (klt, image_check):
+    for module in (frame_images, image_check):
         monkeypatch.setattr(
             module, "half_image", lambda image: (halved.append(image), half_image(image))[1]
         )

@@ -18,7 +18,7 @@ from tests.frontend.test_frontend_outliers import (
     scene,
 )
 from tests.guards import lines_of
-from vio.frontend.klt import KltFrontend
+from vio.frontend.frame_images import FrameImages
 from vio.frontend.moving_object import (
     TwoMotions,
     choose_motion,
@@ -30,9 +30,11 @@ from vio.frontend.object_report import ObjectReport
 from vio.frontend.outliers import Consensus, pixel_errors, rigid_consensus
 from vio.frontend.patches import ImageLevels
 from vio.frontend.prediction import usable_prior
-from vio.frontend.right_match import FrameImages
-from vio.frontend.settings import FrontendSettings
-from vio.frontend.tracks import new_tracks
+from vio.frontend.right_images import RightImages
+from vio.frontend.settings import DisparitySettings
+from vio.frontend.static_features import StaticFeatures
+from vio.frontend.stereo_fit import StereoFit
+from vio.frontend.tracks import ANCHOR_RADIUS_PX, AnchorBank, new_tracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import project, triangulate
 from vio.records import BoolArray, MotionPrior, StereoFrame, TrackPrior
@@ -387,8 +389,9 @@ def _lines(p: FloatArray, z: FloatArray, uv: FloatArray) -> list[str]:
 
     Features at stereo pixels z (N, 4), taken for points p (N, 3), move to left pixels uv (N, 2).
     """
-    frontend = KltFrontend(CAMERA, FrontendSettings())
-    stereo, _ = frontend._set_up((480, 1220))
+    bank = AnchorBank(len(p), ANCHOR_RADIUS_PX)
+    stereo = StereoFit(CAMERA, DisparitySettings(), bank, (1220, 480))
+    static = StaticFeatures(RightImages(CAMERA))
     blank = ImageLevels(np.zeros((480, 1220), np.uint8), np.zeros((240, 610), np.uint8))
     everything = np.ones(len(p), dtype=np.bool_)
     new = new_tracks(z[:, :2].copy(), np.zeros(len(p), dtype=np.int64))
@@ -397,8 +400,8 @@ def _lines(p: FloatArray, z: FloatArray, uv: FloatArray) -> list[str]:
         stereo.update_rows(tracks)
     for k in range(6):
         images = FrameImages(StereoFrame(k, 0, None, None), blank, None, stereo)
-        frontend._reject_outliers(make_problem(), tracks, uv, everything, None, np.eye(4), images)
-    return [finding.message for finding in frontend._take_findings()]
+        static.select(make_problem(), tracks, uv, everything, None, np.eye(4), images)
+    return [finding.message for finding in static.take_findings()]
 
 
 def _yawed(z: FloatArray) -> FloatArray:

@@ -208,7 +208,7 @@ def test_covariances_of_positions_and_points_match_sampling(saved: TrackedPath) 
 
 
 # --- models
-# ---------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_a_model_projects_as_our_camera_with_an_offset_of_half_a_pixel(
@@ -276,7 +276,7 @@ def test_reads_a_model_as_a_trajectory(saved: TrackedPath, tmp_path: Path, stamp
 
 
 # --- refinement
-# -----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_refine_lowers_the_error_and_does_not_change_the_run(
@@ -409,7 +409,7 @@ def test_refine_reports_unusable_runs(
 
 
 # --- export
-# ---------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_export_without_images_is_a_reference_for_eval(
@@ -577,7 +577,7 @@ def test_calibrate_measures_rectified_images_and_reports_swapped_ones(
 
 
 # --- comparison
-# -----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_comparison_estimates_the_scale_and_locates_a_jump(saved: TrackedPath) -> None:

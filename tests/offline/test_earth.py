@@ -234,7 +234,7 @@ def test_too_few_positions_are_refused_with_both_spans() -> None:
 
 
 # --- readers
-# --------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def _csv(path: Path, fixes: GnssFixes, *, sigmas: bool = True, offset_s: float = 0.0) -> Path:
@@ -334,7 +334,7 @@ def test_reads_navsatfix_of_a_bag(tmp_path: Path, storage: str) -> None:
 
 
 # --- the command
-# ----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def _map_of(path: Path, drive: Drive, up_map: FloatArray | None = None) -> Path:

@@ -456,15 +456,27 @@ def test_make_of_the_docs_knows_its_targets_and_variables(name: str, command: st
         )
 
 
-@pytest.mark.parametrize(
-    ("name", "command"), [c for c in _ALL_COMMANDS if c[1].startswith("python tools")]
-)
-def test_tools_of_the_docs_take_their_options(name: str, command: str) -> None:
-    _, tool, *argv = shlex.split(command)
-    source = (ROOT / tool).read_text(encoding="utf-8")
-    assert [
-        option for option in argv if option.startswith("--") and f'"{option}"' not in source
-    ] == []
+_TOOL = re.compile(r"python (?:-m (tools[.\w]+)|(tools/\w+)\.py)(.*)")
+_TOOL_CALLS = [
+    (name, found)
+    for name in _OF_COMMANDS
+    for command in (*_commands(name), *_snippets(name))
+    if (found := _TOOL.fullmatch(command))
+]
+
+
+@pytest.mark.parametrize(("name", "call"), _TOOL_CALLS, ids=lambda value: str(value)[-60:])
+def test_tools_of_the_docs_take_their_options(name: str, call: re.Match[str]) -> None:
+    """The module exists, and its source names the options."""
+    tool = ROOT / (call[1] or call[2]).replace(".", "/")
+    file = tool / "__main__.py" if tool.is_dir() else tool.with_suffix(".py")
+    source = file.read_text(encoding="utf-8")
+    options = [word for word in shlex.split(call[3]) if word.startswith("--")]
+    assert [option for option in options if f'"{option}"' not in source] == []
+
+
+def test_the_docs_name_tools() -> None:
+    assert len(_TOOL_CALLS) >= 10
 
 
 def test_every_dependency_has_its_row() -> None:

@@ -57,7 +57,7 @@ def _recording(plain: Simulation, effects: SensorEffects) -> SimulatedRecording:
 
 
 # --- effects
-# --------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 GRAY: Radiance = np.full((80, 100), 100.0, dtype=np.float32)
@@ -147,7 +147,7 @@ def test_flow_is_the_exact_map(plain: Simulation) -> None:
 
 
 # --- recordings
-# -----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_events_are_in_time_order_with_ground_truth(plain: Simulation) -> None:
@@ -218,7 +218,7 @@ def test_rejects_image_times_outside_the_ground_truth(tmp_path: Path) -> None:
 
 
 # --- oracle
-# ---------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def _run(oracle: OracleFrontend, simulation: Simulation) -> list[FrontendOutput]:
@@ -297,7 +297,7 @@ def test_oracle_and_recording_need_a_rectified_rig(world: World) -> None:
 
 
 # --- export
-# ---------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def _short(plain: Simulation, frames: int = 3) -> SimulatedRecording:

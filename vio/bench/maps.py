@@ -36,8 +36,8 @@ from vio.runs.pipeline import RunResult
 class _LoopRules:
     """What counts as a revisit, a false loop, and a place."""
 
-    # A keyframe is at a place seen before where a keyframe of an earlier visit is so near and looks the
-    # same way.
+    # A keyframe is at a place seen before where a keyframe of an earlier visit is so near and looks
+    # the same way.
     revisit_m: float = 3.0
     revisit_deg: float = 30.0
     false_m: float = 0.5  # error of a loop's motion, or of a place, from which it is false

@@ -19,7 +19,8 @@ from vio.records import NS_PER_S, IntArray, Recording
 class _StampRules(NamedTuple):
     """Which stamps belong together."""
 
-    # of an interval that a frame may come early: cameras jitter, and 30 frames/s are rarely exactly 30
+    # of an interval that a frame may come early: cameras jitter, and 30 frames/s are rarely exactly
+    # 30
     early_share: float = 0.1
     # allowed deviation of the offset between paired stamps from its median
     jitter_ns: int = 1_000_000

@@ -112,7 +112,7 @@ def read_extrinsics(path: Path) -> FloatArray | None:
 
 
 # --- writing
-# --------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def write_calibration(folder: Path, camera: StereoCamera, T_cam0_imu: FloatArray | None) -> None:

@@ -24,9 +24,10 @@ LISTS = ("rgb.txt", "depth.txt")
 DEPTH_FACTOR = 5000.0  # levels per metre of TUM's depth images
 # as TUM's own tool associates colour and depth, which have exposures of their own
 _ASSOCIATED_NS = 20_000_000
-# Words of the folder's name, and the intrinsics with radial-tangential distortion of the camera that
-# is published for it, where the sequences have no file of them: TUM's three cameras, Bonn's dynamic
-# sequences (Palazzolo et al., ReFusion, 2019), and ICL-NUIM's rendered rooms (Handa et al., 2014).
+# Words of the folder's name, and the intrinsics with radial-tangential distortion of the camera
+# that is published for it, where the sequences have no file of them: TUM's three cameras, Bonn's
+# dynamic sequences (Palazzolo et al., ReFusion, 2019), and ICL-NUIM's rendered rooms (Handa et al.,
+# 2014).
 _PUBLISHED: tuple[tuple[str, tuple[str, ...], tuple[float, ...]], ...] = (
     ("TUM's freiburg1", ("freiburg1",),
      (517.306408, 516.469215, 318.643040, 255.313989, 0.262383, -0.953104, -0.005358, 0.002628, 1.163314)),

@@ -60,7 +60,8 @@ class _SuspicionRules:
 
     # ratio of path lengths above which the reference may be another recording's
     path_ratio: float = 1.5
-    # a ratio of path lengths so near one of these is no chance; odometry without a scale has any ratio
+    # a ratio of path lengths so near one of these is no chance; odometry without a scale has any
+    # ratio
     unit_share: float = 0.1
     path_min_m: float = 1.0  # paths below this may consist of noise
     matched_share: float = 0.5  # of the shorter trajectory; below, clocks or recordings may differ

@@ -25,10 +25,10 @@ IMU_TERMS = len(IMU_ENTRIES)
 class _LeverRules(NamedTuple):
     """When readings say something of the terms."""
 
-    # A lever that contains the noise of its own interval biases a scale by minus the noise's share of
-    # the lever's square: at rest the readings are noise, which a scale of zero would explain. This
-    # share is kept below 0.2 %, a fifth of what consumer IMUs' scales are off by; without it a gyro's
-    # scale moved by 0.5 % in 20 s of standstill.
+    # A lever that contains the noise of its own interval biases a scale by minus the noise's share
+    # of the lever's square: at rest the readings are noise, which a scale of zero would explain.
+    # This share is kept below 0.2 %, a fifth of what consumer IMUs' scales are off by; without it a
+    # gyro's scale moved by 0.5 % in 20 s of standstill.
     clear_of_noise: float = 500.0
     # over which readings are averaged: a tenth of a second of noise is a tenth of it
     averaged_s: float = 1.0

@@ -78,7 +78,8 @@ class _GravityRules(NamedTuple):
     """What a start in motion takes of gravity, and how long it waits."""
 
     tilt_sigma_rad: float = np.radians(15.0)  # of gravity by the linear solution
-    # from the first contradiction, after which a start is taken with a covariance that allows for it
+    # from the first contradiction, after which a start is taken with a covariance that allows for
+    # it
     patience_s: float = 5.0
 
 

@@ -18,7 +18,8 @@ from vio.numerics.statistics import chi_square_cdf, chi_square_quantile
 class _NoiseRules(NamedTuple):
     """How the process noise is learned from the corrections."""
 
-    # over which corrections are summed: errors that last, such as a gyro's scale, show only in the sum
+    # over which corrections are summed: errors that last, such as a gyro's scale, show only in the
+    # sum
     summed_steps: int = 10
     # share of its predicted variance that the images must have removed for a direction to count
     informed_share: float = 0.3

@@ -29,13 +29,13 @@ class _ScaleRules(NamedTuple):
     # More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
     min_log: float = 0.04
     min_sigmas: float = 5.0
-    # The accelerometer's noise is in the motion that is held against the images, and there passes for
-    # motion at twice the scale. It has three degrees of freedom in a frame, of which images determine a
-    # part: 0.1 of information on a recording of standstill, with more where the real noise is that of
-    # the settings. One is allowed for.
+    # The accelerometer's noise is in the motion that is held against the images, and there passes
+    # for motion at twice the scale. It has three degrees of freedom in a frame, of which images
+    # determine a part: 0.1 of information on a recording of standstill, with more where the real
+    # noise is that of the settings. One is allowed for.
     information_by_noise: float = 1.0
-    # A velocity's squared standard deviations beyond which its own error makes less than 3 % of what it
-    # says of the scale.
+    # A velocity's squared standard deviations beyond which its own error makes less than 3 % of
+    # what it says of the scale.
     clear_squared_sigmas: float = 100.0
 
 

@@ -36,7 +36,8 @@ class _StampRules(NamedTuple):
     # a stamp so far ahead, and so many times the last step, is to be confirmed
     jump_ns: int = 2_000_000_000
     jump_steps: int = 5
-    # Steps that are shorter from the start are of another unit: frames at 2 kHz, samples at 100 kHz.
+    # Steps that are shorter from the start are of another unit: frames at 2 kHz, samples at 100
+    # kHz.
     min_frame_step_ns: int = 500_000
     min_sample_step_ns: int = 10_000
     short_steps: int = 2  # in a row before the unit is doubted: two frames may share an arrival

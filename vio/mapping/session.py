@@ -42,7 +42,8 @@ class _KeyframeRules(NamedTuple):
 
     # of the last keyframe's features that are still seen: below it, a new keyframe
     max_shared_share: float = 0.6
-    # keyframes without a result, where the odometry waits for none: beyond, the next one comes later
+    # keyframes without a result, where the odometry waits for none: beyond, the next one comes
+    # later
     max_waiting: int = 3
 
 

@@ -45,8 +45,9 @@ AXES_WORSE = 3.0  # ratio of the given axes' squared misfit to that of others
 class _OtherScale(NamedTuple):
     """When the camera's motion is of another scale than the readings."""
 
-    # Factor on the camera's motion from which on it is judged here; smaller ones are estimated while
-    # running. Of right baselines it came to 0.96 to 1.11 in windows of 4 s and more of two flights.
+    # Factor on the camera's motion from which on it is judged here; smaller ones are estimated
+    # while running. Of right baselines it came to 0.96 to 1.11 in windows of 4 s and more of two
+    # flights.
     min_factor: float = 3.0
     # of the camera's squared path, which the scaled readings leave a part of
     explained_ratio: float = 4.0

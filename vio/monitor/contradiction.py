@@ -23,9 +23,10 @@ class _ContradictionRules(NamedTuple):
 
     min_sigmas: float = 4.0  # median innovation over its standard deviation
     newest_frames: int = 24  # the newest, of which …
-    # … so many are contradicted. Healthy ones come to 13 of 24 where a flight begins with vibrations
-    # that the stated noise lacks and the filter learns (images rendered along MH_03, its real IMU:
-    # 7 of the first 8, ATE 0.3 mm); clocks 0.1 s off and an IMU turned by 18 degrees to 21 and more.
+    # … so many are contradicted. Healthy ones come to 13 of 24 where a flight begins with
+    # vibrations that the stated noise lacks and the filter learns (images rendered along MH_03, its
+    # real IMU: 7 of the first 8, ATE 0.3 mm); clocks 0.1 s off and an IMU turned by 18 degrees to
+    # 21 and more.
     min_frames: int = 20
     quiet_frames: int = 20  # in a row without one, after which IMU and images agree again
 

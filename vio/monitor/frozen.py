@@ -63,9 +63,9 @@ _FLOW = _FlowRules()
 class _BegunRules(NamedTuple):
     """When a motion has begun during images that were taken for a standstill."""
 
-    # Equal images that were taken for a standstill are ended by a motion that begins. One that is there
-    # at once, beyond so many pixels and times the flow before, or loses so many features, has gone on
-    # unseen.
+    # Equal images that were taken for a standstill are ended by a motion that begins. One that is
+    # there at once, beyond so many pixels and times the flow before, or loses so many features, has
+    # gone on unseen.
     min_px: float = 3.0
     factor: float = 10.0
     lost_share: float = 0.2

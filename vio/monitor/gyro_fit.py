@@ -24,7 +24,8 @@ class _RateRules(NamedTuple):
     clear_of_noise: float = 5.0  # the camera's rates must exceed their noise by this factor
     # misfit over the best linear map, as a share of the rotation: 11 degrees, or 20 % of scale
     excess_share: float = 0.2
-    # over the intervals, times the unexplained share: squared excess due to the map's free parameters
+    # over the intervals, times the unexplained share: squared excess due to the map's free
+    # parameters
     chance_intervals: float = 30.0
     clearly_worse: float = 2.0
     named_offset_s: float = 0.02

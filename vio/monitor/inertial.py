@@ -39,7 +39,8 @@ class _EvaluationRules(NamedTuple):
     """When the IMU is judged."""
 
     min_intervals_at_end: int = 20  # intervals needed to judge at the end of a run
-    # intervals between evaluations after `_EVALUATIONS.enough_intervals`; until then `FIRST_EVALUATION`
+    # intervals between evaluations after `_EVALUATIONS.enough_intervals`; until then
+    # `FIRST_EVALUATION`
     later_intervals: int = 150
     # intervals with rotation about all axes after which the comparison ends
     enough_intervals: int = 400

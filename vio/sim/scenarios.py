@@ -280,7 +280,7 @@ def scaled(rig: StereoRig, width: int | None) -> StereoRig:
 
 
 # --- motion
-# ---------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def _recorded(scenario: Scenario) -> tuple[MotionSpline, IntArray, ImuRecord | None]:
@@ -354,7 +354,7 @@ def _regular(start_ns: int, duration_s: float, rate_hz: float, *, first: int = 0
 
 
 # --- scenes
-# ---------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def _world(scenario: Scenario, motion: MotionSpline) -> World:

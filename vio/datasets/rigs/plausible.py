@@ -23,9 +23,10 @@ class _ImageSizeRules(NamedTuple):
 
     # Ratio of twice the principal point to the image size, along both axes in one direction, beyond
     # which the images are of another size. One axis may be off by a tenth (KITTI's raw images). Of
-    # twelve cameras with a recording none is off by more than 0.02 along both in one direction, but of
-    # fourteen others in public reports four are, by 0.027 to 0.039: so between the two it is a note
-    # and no doubt. A smaller scaling shows in the turns against a gyro (`vio.monitor.rotation_comparison`).
+    # twelve cameras with a recording none is off by more than 0.02 along both in one direction, but
+    # of fourteen others in public reports four are, by 0.027 to 0.039: so between the two it is a
+    # note and no doubt. A smaller scaling shows in the turns against a gyro
+    # (`vio.monitor.rotation_comparison`).
     scaled_ratio: float = 1.05
     # Ratio of the two focal lengths beyond which images were stretched
     stretched_ratio: float = 1.1

@@ -35,7 +35,8 @@ class _ModelRules(NamedTuple):
     # keyframes up to which all left images are matched, so that a loop that the run missed is found
     exhaustive_images: int = 60
     min_registered: int = 3
-    # keyframes across which a step of the path may be joined; those further apart are joined by a loop
+    # keyframes across which a step of the path may be joined; those further apart are joined by a
+    # loop
     linked_images: int = 6
 
 
