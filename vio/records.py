@@ -183,13 +183,12 @@ class Observations:
         values.
         """
         shape = getattr(self.ids, "shape", None)
-        for name, dtype, expected in (
-            ("ids", _INT64, shape if shape is not None and len(shape) == 1 else ("N",)),
-            ("z", _FLOAT64, (*shape, 4) if shape is not None else ("N", 4)),
-            ("has_right", _BOOL, shape),
-            ("stale", _BOOL, shape),
+        for name, value, dtype, expected in (
+            ("ids", self.ids, _INT64, shape if shape is not None and len(shape) == 1 else ("N",)),
+            ("z", self.z, _FLOAT64, (*shape, 4) if shape is not None else ("N", 4)),
+            ("has_right", self.has_right, _BOOL, shape),
+            ("stale", self.stale, _BOOL, shape),
         ):
-            value = getattr(self, name)
             if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != expected:
                 raise DataError(
                     f"Observations of frame {self.frame_index}: {name} is {_type_text(value)}, not "
