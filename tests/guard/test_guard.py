@@ -20,6 +20,7 @@ from vio.findings import CODES
 from vio.frontend import build_frontend
 from vio.frontend.precomputed import PrecomputedFrontend
 from vio.frontend.settings import FrontendSettings, GridSettings
+from vio.guard.exchange import ExchangeDetector
 from vio.guard.guarded import GuardedFrontend, guarded
 from vio.guard.image_check import images_of
 from vio.guard.pairing import PairingCheck, find_delay, told_delay
@@ -294,6 +295,27 @@ def test_shifted_pairs_are_reported_in_the_first_frames(name: str, delay: int) -
     assert finding.first_frame == 0
     assert finding.frame is not None
     assert finding.frame < 6 + abs(delay)
+
+
+@pytest.mark.parametrize("delay", [-3, 2])
+def test_shifted_pairs_are_found_although_their_images_look_exchanged(
+    delay: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rig that turns gives images of two times negative disparities."""
+    monkeypatch.setattr(ExchangeDetector, "order", lambda *args, **kwargs: "exchanged")
+    frontend = guarded(build_frontend("klt", CAMERA, SETTINGS), CAMERA)
+    outputs = [frontend.process(frame) for frame in shifted(delay)]
+    assert "pairs-shifted" in [f.code for output in outputs for f in output.findings]
+
+
+def test_exchanged_images_are_none_of_another_time() -> None:
+    check = PairingCheck(RowProbe())
+    for pair in [*frames(), *frames()[::-1], *frames()]:
+        exchanged = replace(pair, left=pair.right, right=pair.left)
+        images = images_of(exchanged, pair=True)
+        assert images is not None
+        check.inspect(images)
+    assert check.delay is None
 
 
 @pytest.mark.parametrize("delay", range(-3, 4))

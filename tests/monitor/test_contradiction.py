@@ -1,4 +1,4 @@
-"""Whether the IMU contradicts the images: named within thirty frames, and only then."""
+"""Whether the IMU contradicts the images: named within fifteen frames, and only then."""
 
 from __future__ import annotations
 
@@ -31,13 +31,15 @@ def _found(ratios: list[float]) -> list[Finding]:
 
 
 @pytest.mark.parametrize("ratios", [CLOCK, EARLY, TURNED], ids=["clock", "early", "turned"])
-def test_an_imu_that_contradicts_the_images_is_named_within_thirty_frames(
+def test_an_imu_that_contradicts_the_images_is_named_within_fifteen_frames(
     ratios: list[float],
 ) -> None:
     (found,) = _found(ratios)
     assert found.code == "imu-disagrees"
     assert found.frame is not None
-    assert found.frame <= 30
+    assert found.frame <= 15
+    assert found.first_frame is not None
+    assert found.first_frame <= 3
 
 
 @pytest.mark.parametrize("ratios", [MH_01, V1_02, MH_03], ids=["MH_01", "V1_02", "MH_03"])
@@ -46,8 +48,14 @@ def test_an_imu_that_agrees_is_not_named(ratios: list[float]) -> None:
 
 
 def test_as_many_frames_as_stated_are_needed() -> None:
-    assert not _found([9.0] * 19 + [1.0] * 30)
-    assert _found([9.0] * 20)
+    assert not _found([5.0] * 19 + [1.0] * 30)
+    assert _found([5.0] * 20)
+
+
+def test_frames_that_are_further_off_are_needed_less_often() -> None:
+    assert not _found([30.0] * 7 + [1.0] * 30)
+    assert [f.frame for f in _found([1.0] * 5 + [30.0] * 8)] == [13]
+    assert [f.frame for f in _found([1.0] * 5 + [9.0] * 10)] == [15]
 
 
 def test_a_shock_is_no_contradiction() -> None:
@@ -57,9 +65,9 @@ def test_a_shock_is_no_contradiction() -> None:
 def test_an_event_has_one_beginning_and_one_end() -> None:
     found = _found([1.0] * 5 + [9.0] * 24 + [1.0] * 40 + [9.0] * 20)
     assert [(f.frame, f.first_frame, f.ended) for f in found] == [
-        (25, 6, False),
+        (15, 6, False),
         (49, 49, True),
-        (89, 70, False),
+        (79, 70, False),
     ]
     assert found[0].figures["innovation_ratio"] == 9.0
 

@@ -33,7 +33,8 @@ _FEW_MATCHES = 0.2
 def image_checks(camera: StereoCamera) -> tuple[ImageCheck, ...]:
     """Return the checks of the images of a camera, in their order.
 
-    A frozen image looks as if it were the other camera's, so that is asked first.
+    A frozen image looks as if it were the other camera's, so that is asked first. So do images of two
+    times, and are paired anew before they could be exchanged.
     """
     if camera.kind != "stereo":
         return (LostContrast(),)
@@ -43,8 +44,8 @@ def image_checks(camera: StereoCamera) -> tuple[ImageCheck, ...]:
         LostContrast(),
         FrozenCamera(),
         SwapDetector(probe),
-        ExchangeDetector(probe),
         PairingCheck(probe),
+        ExchangeDetector(probe),
     )
 
 

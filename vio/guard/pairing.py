@@ -137,6 +137,10 @@ class PairingCheck(ImageCheck):
 
     def _count(self, index: int, now: _Halves, last: _Halves) -> None:
         """Count the matches of a frame, and decide once those of enough frames tell."""
+        if self._looks_exchanged(now):
+            self._last = None
+            self._recent.clear()
+            return
         points = min(len(now.corners), len(last.corners))
         if points >= _PAIRING.min_points:
             self._points += points
@@ -159,6 +163,16 @@ class PairingCheck(ImageCheck):
         """Add how many corners of the left image of each pairing match in its right one."""
         for delay, (left, right) in pairings.items():
             matched[delay] += self._probe.on_rows(left.left, right.right, left.corners)
+
+    def _looks_exchanged(self, now: _Halves) -> bool:
+        """Whether the images of a frame match if left and right are exchanged: the rows of an
+        exchanged pair agree, those of images of two times do not.
+        """
+        corners = self._probe.corners(now.right)
+        matched = self._probe.on_rows(now.right, now.left, corners)
+        given = self._probe.on_rows(now.left, now.right, now.corners)
+        few = max(_PAIRING.min_share * len(corners), _PAIRING.clear_factor * given)
+        return len(corners) >= _PAIRING.min_points and matched >= few
 
     def _far_delay(self, now: _Halves) -> int | None:
         """Count the matches of a frame in all pairings, and return the delay that they tell, unless

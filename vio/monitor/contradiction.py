@@ -4,7 +4,9 @@ after frame.
 Innovations over the standard deviations that the filter expects of them are about 1, whatever the
 motion is. Wrong axes, extrinsics, stamps or scales of an IMU show in them from the first turn on,
 long before enough motion has been seen to tell which of these it is (`vio.monitor.inertial`). A
-shock or an object that moves makes single frames stand out.
+shock or an object that moves makes single frames stand out. So frames are counted, and what they are
+off by is summed, each up to a limit: the more, the fewer frames are needed.
+Reference: Page, Continuous inspection schemes, Biometrika (1954), for the sum.
 """
 
 from __future__ import annotations
@@ -28,6 +30,9 @@ class _ContradictionRules(NamedTuple):
     # real IMU: 7 of the first 8, ATE 0.3 mm); clocks 0.1 s off and an IMU turned by 18 degrees to
     # 21 and more.
     min_frames: int = 20
+    # of the sum of the logarithms of ratios over `min_sigmas`; of the healthy ones above, 4.7 at most
+    min_sum: float = 8.0
+    max_of_a_frame: float = 1.0  # what one frame adds to it at most
     quiet_frames: int = 20  # in a row without one, after which IMU and images agree again
 
 
@@ -42,6 +47,8 @@ class ImuContradiction:
         self._ratios = deque[tuple[int, float]](
             maxlen=_CONTRADICTION.newest_frames
         )  # with the numbers of the frames
+        self._sum = 0.0  # of what frames are off by, as long as it is positive
+        self._sum_since = 0  # the frame from which on it is
         self._quiet = 0  # frames in a row
         self._reported = False
 
@@ -55,12 +62,13 @@ class ImuContradiction:
         if innovation_ratio is None:
             return []
         self._ratios.append((index, innovation_ratio))
+        self._add(index, innovation_ratio)
         is_off = innovation_ratio > _CONTRADICTION.min_sigmas
         self._quiet = 0 if is_off else self._quiet + 1
         if self._reported:
             return self.end(index) if self._quiet >= _CONTRADICTION.quiet_frames else []
         off = [(frame, ratio) for frame, ratio in self._ratios if ratio > _CONTRADICTION.min_sigmas]
-        if len(off) < _CONTRADICTION.min_frames:
+        if len(off) < _CONTRADICTION.min_frames and self._sum < _CONTRADICTION.min_sum:
             return []
         self._reported = True
         ratio = median(np.array([ratio for _, ratio in off]))
@@ -70,11 +78,20 @@ class ImuContradiction:
             "axes, units, range and mount (vio check)"
         )
         figures = {"innovation_ratio": ratio}
-        return [Finding(_CODE, message, index, off[0][0], lasts=True, figures=figures)]
+        since = min(off[0][0], self._sum_since) if self._sum > 0.0 else off[0][0]
+        return [Finding(_CODE, message, index, since, lasts=True, figures=figures)]
+
+    def _add(self, index: int, ratio: float) -> None:
+        """Add what a frame is off by to the sum."""
+        off = np.log(max(ratio, 1e-3) / _CONTRADICTION.min_sigmas)
+        if self._sum == 0.0:
+            self._sum_since = index
+        self._sum = max(self._sum + min(float(off), _CONTRADICTION.max_of_a_frame), 0.0)
 
     def end(self, index: int) -> list[Finding]:
         """Return that the event has ended, if there is one: the IMU agrees again, or is not used."""
         self._ratios.clear()
+        self._sum = 0.0
         if not self._reported:
             return []
         self._reported = False
