@@ -4,8 +4,12 @@ one-line errors.
 
 from __future__ import annotations
 
+import gzip
+import importlib
+import struct
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,7 +21,8 @@ from tests.bag_maker import Script, noise_frames, of_stereo  # noqa: E402
 from tests.same_events import assert_same_events, frames_of  # noqa: E402
 from vio.cameras.rig import Rig  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
-from vio.datasets.bags.pictures import raw_gray  # noqa: E402
+from vio.datasets.bags.pictures import gray_of, raw_gray  # noqa: E402
+from vio.datasets.images import UnreadableImageError  # noqa: E402
 from vio.datasets.levels import Levels, levels_of  # noqa: E402
 from vio.datasets.rigs.kalibr import kalibr_text  # noqa: E402
 from vio.errors import CalibrationError, DataError, VioError  # noqa: E402
@@ -139,6 +144,35 @@ def test_compressed_images_and_empty_topics(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.left, left)
         np.testing.assert_array_equal(frame.right, right)
     assert "topics without a message: /bob/imu, /lidar" in dataset.recording.notes
+
+
+@pytest.mark.parametrize("packing", ["gzip", "zstd"])
+def test_images_of_zstd_transport_are_read(packing: str, tmp_path: Path) -> None:
+    """Its earlier versions name gzip so."""
+    script = plain_script(imu=False, frames=0)
+    zstd = vars(importlib.import_module("rosbags.rosbag2.reader"))["zstd"]
+    pack = gzip.compress if packing == "gzip" else zstd.compress
+    kind = "sensor_msgs/msg/CompressedImage"
+    for time_ns, *images in noise_frames(4):
+        for side, image in zip(("left", "right"), images, strict=True):
+            height, width = image.shape
+            head = struct.pack("<IIBII", height, width, 0, width, 5) + b"mono8"
+            data = np.frombuffer(head + pack(image.tobytes()), np.uint8)
+            fields = script.make(kind, script.header(time_ns, side), "zstd", data)
+            script.add(f"/{side}/image_raw/zstd", kind, time_ns, fields)
+    frames = frames_of(open_dataset(script.write(tmp_path / "f")))
+    for frame, (_, left, right) in zip(frames, noise_frames(4), strict=True):
+        np.testing.assert_array_equal(frame.left, left)
+        np.testing.assert_array_equal(frame.right, right)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\1" * 17, struct.pack("<IIBII", 2, 2, 0, 2, 5) + b"mono8(\xb5/\xfdx"]
+)
+def test_damaged_images_of_zstd_transport_are_named(data: bytes) -> None:
+    fields = SimpleNamespace(format="zstd", data=data)
+    with pytest.raises(UnreadableImageError, match="frame 3: does not decompress"):
+        gray_of(fields, "frame 3", compressed=True)
 
 
 def test_compressed_images_that_ros_rectified_stay_as_they_are(tmp_path: Path) -> None:

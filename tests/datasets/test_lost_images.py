@@ -9,9 +9,12 @@ from pathlib import Path
 import pytest
 
 from tests.frontend.test_frontend_scene import CAMERA, flight, stereo_frame
+from tests.guards import guarded_klt
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
 from vio.datasets.images import write_png
+from vio.inspection.finding import Inspection
+from vio.inspection.inspect import inspect_recording
 from vio.records import Image
 
 FRAMES = 50
@@ -99,3 +102,21 @@ def test_images_are_paired_by_the_lists_of_both_cameras(
     assert rows == [(k, k) for k in kept]
     assert (dataset.recording.frame_times_ns - 10**18).tolist() == [50_000_000 * k for k in kept]
     assert not any("not used" in note for note in dataset.recording.notes)
+
+
+def _inspected(folder: Path) -> Inspection:
+    dataset = open_dataset(folder)
+    return inspect_recording(dataset, lambda _: guarded_klt(CAMERA), pairs=2, tracked=2)
+
+
+def test_inspect_names_images_that_both_cameras_lost(tmp_path: Path) -> None:
+    """There are as many of both, and pairs are a frame apart in between."""
+    (fault,) = _inspected(_numbered(tmp_path, ((38,), (12,)))).faults
+    assert "each right image comes a frame" in fault or "each left image comes a frame" in fault
+    assert "a camera has lost images" in fault
+
+
+def test_inspect_passes_over_an_image_that_cannot_be_read(tmp_path: Path) -> None:
+    folder = _numbered(tmp_path, ((), ()))
+    (folder / "right" / "000000.png").write_bytes(b"nothing")
+    assert _inspected(folder).faults == ()

@@ -18,7 +18,7 @@ from tests.euroc_maker import RADTAN_RIG
 from tests.plain_maker import make_plain
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
-from vio.datasets.images import exif_turn
+from vio.datasets.images import UnreadableImageError, exif_turn, load_gray
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.sides import split_sides
 from vio.errors import CalibrationError, DataError, VioError
@@ -182,17 +182,20 @@ def _jpeg_with_exif(path: Path, orientation: int, order: str) -> None:
 
 
 @pytest.mark.parametrize("order", "<>")
-@pytest.mark.parametrize(("orientation", "turn"), [(1, 0), (3, 180), (6, 90), (8, 270)])
-def test_images_that_ask_to_be_turned_are_doubted(
-    orientation: int, turn: int, order: str, tmp_path: Path
+@pytest.mark.parametrize(
+    ("orientation", "turn"),
+    [(1, ""), (2, "mirrored"), (3, "turned by 180 degrees"), (8, "turned by 270 degrees")],
+)
+def test_images_that_ask_to_be_turned_or_mirrored_are_doubted(
+    orientation: int, turn: str, order: str, tmp_path: Path
 ) -> None:
     folder = make_plain(tmp_path)
     for file in list(folder.glob("*/*.png")):
         _jpeg_with_exif(file, orientation, order)
     assert exif_turn(folder / "left" / "0.jpg") == turn
     said = [note for note in open_dataset(folder).recording.notes if "EXIF" in note]
-    assert len(said) == (turn != 0)
-    assert all(f"doubtful: the images ask to be turned by {turn} degrees" in note for note in said)
+    assert len(said) == bool(turn)
+    assert all(f"doubtful: the images ask to be {turn} (EXIF)" in note for note in said)
 
 
 def _bare(folder: Path, text: str) -> vio.Rig:
@@ -325,3 +328,70 @@ def test_the_second_camera_of_eth3d_is_the_left_one(tmp_path: Path) -> None:
     # the centre of the left camera, which rectifying does not move
     centres = [(T @ truth.right[1])[:3, 3] for T in T_world_right]
     np.testing.assert_allclose(recording.reference.T_world_body[:, :3, 3], centres, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["times.csv", "timestamps.csv"])
+def test_lists_of_times_may_be_csv(name: str, tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, 5)
+    expected = open_dataset(folder).recording.frame_times_ns
+    (folder / "times.txt").unlink()
+    rows = "".join(f"{k},{stamp}\n" for k, stamp in enumerate(expected.tolist()))
+    (folder / name).write_text(f"frame,timestamp_ns\n{rows}")
+    recording = open_dataset(folder).recording
+    assert recording.frame_times_ns.tolist() == expected.tolist()
+    assert not any("not used" in note for note in recording.notes)
+
+
+def test_pgm_as_text_is_read_and_a_truncated_one_is_named(tmp_path: Path) -> None:
+    levels = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    text = "P2\n# a comment\n4 3\n255\n" + " ".join(map(str, levels.ravel())) + "\n"
+    (tmp_path / "a.pgm").write_text(text)
+    np.testing.assert_array_equal(load_gray(tmp_path / "a.pgm")[0], levels)
+    (tmp_path / "b.pgm").write_text(text[:-8])
+    with pytest.raises(UnreadableImageError, match="the PGM or PPM is truncated"):
+        load_gray(tmp_path / "b.pgm")
+
+
+def test_jpeg_may_be_named_jfif(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, 4)
+    for file in list(folder.glob("*/*.png")):
+        image = load_gray(file)[0]
+        cv2.imwrite(str(file.with_suffix(".jpg")), image)
+        file.with_suffix(".jpg").rename(file.with_suffix(".JFIF"))
+        file.unlink()
+    assert len(open_dataset(folder).recording.frame_times_ns) == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("left.zip", "left.zip: is an archive; unpack it"),
+        ("bag.db3.zstd", "its folder with metadata.yaml is read as it is"),
+        ("left/0.jp2", "holds 1 files .jp2, which are not read; write the images as PNG"),
+        ("left/0.heic", "holds 1 files .heic, which are not read"),
+    ],
+)
+def test_files_of_other_forms_are_named_with_what_to_do(
+    name: str, said: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_bytes(b"something")
+    with pytest.raises(DataError, match=re.escape(said)):
+        open_dataset(tmp_path)
+
+
+def test_a_camchain_whose_cameras_are_counted_from_one_says_so(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    file = folder / "camchain-imucam.yaml"
+    text = file.read_text().replace("cam1:", "cam2:").replace("cam0:", "cam1:")
+    file.write_text(text)
+    with pytest.raises(CalibrationError, match="names its cameras cam1, cam2; Kalibr's are cam0"):
+        open_dataset(folder)
+
+
+def test_a_doubt_about_stretched_images_has_a_factor_for_each_axis(tmp_path: Path) -> None:
+    file = tmp_path / "calib.txt"
+    K = "700 0 640 {} 0 700 360 0 0 0 1 0"
+    file.write_text(f"P0: {K.format(0)}\nP1: {K.format(-70)}\n")
+    (note,) = vio.load_rig(file, image_size=(1024, 648)).notes
+    assert "divide its focal lengths and principal points by 1.25 along x and 1.11 along y" in note

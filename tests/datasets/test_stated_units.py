@@ -47,7 +47,7 @@ def test_units_of_a_gyro(cell: str, factor: float | None) -> None:
         *((f"ax [{unit}]", 1.0) for unit in ("m/s^2", "m s^-2", "m/s²", "m·s⁻²", "m/s/s", "m/s2")),
         *((f"acc_x_{unit}", 1.0) for unit in ("mps2", "ms2", "m_s2", "m/s^2")),
         *((cell, G) for cell in ("ax [g]", "ax (G)", "accel_x_g", "AccX/g", "acc_g_x")),
-        *((cell, 1e-3 * G) for cell in ("ax [mg]", "acc_x_mg", "ax(mg)")),
+        *((cell, 1e-3 * G) for cell in ("ax [mg]", "acc_x_mg", "ax(mg)", "ax [milli-g]")),
         ("ax [cm/s^2]", 1e-2),
         ("ax [m/(s^2)]", 1.0),
         ("accel_x", None),

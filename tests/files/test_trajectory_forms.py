@@ -194,3 +194,21 @@ def test_single_poses_without_orientation_are_left_out(
 def test_what_is_written_states_its_order(tmp_path: Path) -> None:
     write_tum(tmp_path / "out.tum", TRUTH)
     assert read_trajectory(tmp_path / "out.tum").orientations == "stated"
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_decimal_commas_between_semicolons_or_tabs_are_read(separator: str, tmp_path: Path) -> None:
+    rows = [
+        [1700000000000000000 + 50_000_000 * k, 0.5 * k, 1.25, -2.0, 0.5, 0.5, -0.5, 0.5]
+        for k in range(5)
+    ]
+    names = ["timestamp_ns", "x", "y", "z", "qw", "qx", "qy", "qz"]
+    plain = tmp_path / "plain.csv"
+    plain.write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]) + "\n")
+    lines = [separator.join(map(str, row)).replace(".", ",") for row in rows]
+    local = tmp_path / "local.csv"
+    local.write_text("\n".join([separator.join(names), *lines]) + "\n")
+    expected = read_trajectory(plain)
+    read = read_trajectory(local)
+    np.testing.assert_array_equal(read.T_world_body, expected.T_world_body)
+    assert read.times_ns.tolist() == expected.times_ns.tolist()

@@ -173,6 +173,7 @@ def _unknown(path: Path) -> str:
     """Say what is missing where there are images or a video, else what was looked for."""
     from vio.datasets import images, plain, videos
     from vio.datasets.plain import ALONE, images_of_one_camera
+    from vio.datasets.unused import unread_files
 
     if path.is_dir() and len(plain.image_folders(path)) > 1:
         return (
@@ -199,6 +200,8 @@ def _unknown(path: Path) -> str:
         return f"{path}: is one image; give a folder with left and right images and the calibration of the pair"
     if path.suffix.lower() in videos.SUFFIXES:
         return f"{path}: is one video; give a folder with left.mp4, right.mp4 and the calibration of the pair"
+    if (unread := unread_files(path)) is not None:
+        return unread
     return f"{path}: no known recording; looked for {_looked_for()}"
 
 

@@ -149,9 +149,9 @@ def _turn_notes(pairs: ImagePairs) -> tuple[str, ...]:
         with contextlib.suppress(OSError):
             if turn := exif_turn(path):
                 return (
-                    f"{path.parent}: doubtful: the images ask to be turned by {turn} degrees (EXIF), "
-                    "as viewers and OpenCV's imread do; they are read as they are stored; if the "
-                    "calibration is of turned images, write the images turned, without EXIF",
+                    f"{path.parent}: doubtful: the images ask to be {turn} (EXIF), as viewers and "
+                    "OpenCV's imread do; they are read as they are stored; if the calibration is "
+                    "of images as they are shown, write these, without EXIF",
                 )
     return ()
 

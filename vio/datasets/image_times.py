@@ -29,6 +29,7 @@ from vio.files.text import text_lines
 from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
 from vio.records import NS_PER_S, IntArray
 
+_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
 _SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 _LIST_FORM = "timestamp [ns], filename"
@@ -201,8 +202,8 @@ def _own_times(files: ImageFiles, other: Path) -> IntArray | None:
     which is not that of the other camera's images; None: it has none.
     """
     folders = [f for f in (files.folder, files.folder.parent) if f not in (other, other.parent)]
-    named = ("times.txt", "timestamps.txt", "data.csv")
-    file = next((f / name for f in folders for name in named if (f / name).is_file()), None)
+    named = (f / name for f in folders for name in (*_LISTS, "data.csv"))
+    file = next((file for file in named if file.is_file()), None)
     if file is None:
         return None
     with contextlib.suppress(DataError):
@@ -340,7 +341,7 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
 def _file_of_times(layout: Layout) -> Path | None:
     """Return the list of times beside the images; None: there is none."""
     folders = dict.fromkeys((layout.base, layout.root, layout.left, layout.left.parent))
-    named = (folder / name for folder in folders for name in ("times.txt", "timestamps.txt"))
+    named = (folder / name for folder in folders for name in _LISTS)
     return next((file for file in named if file.is_file()), None)
 
 

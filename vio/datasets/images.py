@@ -30,17 +30,26 @@ from vio.geometry.lie import FloatArray
 from vio.records import Image
 
 OTHER_SUFFIXES = (".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp")
-SUFFIXES = (".png", ".jpg", ".jpeg", *OTHER_SUFFIXES)
+SUFFIXES = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", *OTHER_SUFFIXES)
 _TIFF_STARTS = (b"II*\0", b"MM\0*")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
+_NETPBM = (b"P2", b"P3", b"P5", b"P6")  # as text, and in binary
 _MAX_BYTES = 2**29  # of a file: more than 64 Mpx of 16 bits in colour
 # start-of-frame markers, with the image size
 _JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 _EXIF_BYTES = 4096  # from the beginning of a file, where its orientation stands
 _EXIF_ORIENTATION = 0x0112
-_EXIF_TURNS = {3: 180, 4: 180, 5: 90, 6: 90, 7: 270, 8: 270}
+_EXIF_TURNS = {
+    2: "mirrored",
+    3: "turned by 180 degrees",
+    4: "flipped, top to bottom",
+    5: "mirrored and turned by 270 degrees",
+    6: "turned by 90 degrees",
+    7: "mirrored and turned by 90 degrees",
+    8: "turned by 270 degrees",
+}
 _PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
 
 
@@ -110,7 +119,7 @@ def has_16_bits(start: bytes) -> bool | None:
     """
     if start.startswith(_PNG_START):
         return start[24:25] == b"\x10"  # the depth in the header
-    if start.startswith(_TIFF_STARTS) or start[:2] in (b"P5", b"P6"):
+    if start.startswith(_TIFF_STARTS) or start[:2] in _NETPBM:
         return None
     return False
 
@@ -127,11 +136,11 @@ def band_in(data: bytes, where: str) -> Band | None:
     return band_of(pixels) if pixels.dtype.itemsize == 2 else None
 
 
-def exif_turn(path: Path) -> int:
-    """Return by how many degrees clockwise a JPEG file asks to be turned when it is shown; 0: it
+def exif_turn(path: Path) -> str:
+    """Return how a JPEG file asks to be turned (clockwise) or mirrored when it is shown; nothing: it
     does not ask.
 
-    Reference: Exif 2.3, tag 0x0112, in the segment APP1. Mirrored orientations count as their turn.
+    Reference: Exif 2.3, tag 0x0112, in the segment APP1.
 
     Raises:
         OSError: it cannot be read, or is no regular file.
@@ -141,7 +150,7 @@ def exif_turn(path: Path) -> int:
         data = stream.read(_EXIF_BYTES)
     at = data.find(b"Exif\0\0")
     if not data.startswith(_JPEG_START) or at < 0:
-        return 0
+        return ""
     tiff = data[at + 6 :]
     order = ">" if tiff.startswith(b"MM") else "<"
     try:
@@ -152,10 +161,10 @@ def exif_turn(path: Path) -> int:
             (tag,) = struct.unpack_from(f"{order}H", tiff, entry)
             if tag == _EXIF_ORIENTATION:
                 (value,) = struct.unpack_from(f"{order}H", tiff, entry + 8)
-                return _EXIF_TURNS.get(value, 0)
+                return _EXIF_TURNS.get(value, "")
     except struct.error:  # a part of another file, or a damaged one
-        return 0
-    return 0
+        return ""
+    return ""
 
 
 def _load(path: Path, *, colour: bool = False) -> npt.NDArray[Any]:
@@ -397,7 +406,7 @@ def other_damage(data: bytes) -> str | None:
         return "the BMP is truncated" if _size_at(data, 2) > len(data) else None
     if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
         return "the WebP is truncated" if _size_at(data, 4) + 8 > len(data) else None
-    if data[:2] in (b"P5", b"P6"):
+    if data[:2] in _NETPBM:
         return _netpbm_damage(data)
     if data.startswith(_TIFF_STARTS):
         return None
@@ -412,9 +421,13 @@ def _size_at(data: bytes, offset: int) -> int:
 
 def _netpbm_damage(data: bytes) -> str | None:
     """Describe the damage of a PGM or PPM image; None: it is complete."""
-    header = re.match(rb"P[56]\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s", data)
+    header = re.match(rb"P[2356]\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s+(?:#.*\s+)*(\d+)\s", data)
     if header is None:
         return "the PGM or PPM has no valid header"
     width, height, top = (int(x) for x in header.groups())
-    size = width * height * (3 if data[:2] == b"P6" else 1) * (2 if top > 255 else 1)
-    return "the PGM or PPM is truncated" if len(data) - header.end() < size else None
+    values = width * height * (3 if data[:2] in (b"P3", b"P6") else 1)
+    if data[:2] in (b"P2", b"P3"):
+        found = len(data[header.end() :].split(maxsplit=values)[:values])
+    else:
+        found = (len(data) - header.end()) // (2 if top > 255 else 1)
+    return "the PGM or PPM is truncated" if found < values else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -102,4 +103,30 @@ def _belongs(other: Path, calibration: Path) -> bool:
     return (named and not other_chain and other.suffix in (".yaml", ".yml")) or (
         calibration.name.startswith("calib_cam_to_cam")
         and (other.name in ("calib_velo_to_cam.txt", "calib_imu_to_velo.txt"))
+    )
+
+
+_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".xz", ".bz2", ".zst", ".zstd")
+_OTHER_IMAGES = (".jp2", ".j2k", ".gif", ".heic", ".avif", ".jxl", ".exr", ".dng", ".raw", ".npy")
+
+
+def unread_files(path: Path) -> str | None:
+    """Say what to do with archives, or with images of another form, which a path is or a folder and
+    the folders in it hold; None: there are none.
+    """
+    files = [path] if path.is_file() else [*path.glob("*.*"), *path.glob("*/*.*")]
+    archive = next((file for file in files if file.suffix.lower() in _ARCHIVES), None)
+    if archive is not None:
+        inside = Path(archive.stem).suffix.lower() in (".db3", ".mcap", ".bag")
+        folder = (
+            "; of a ROS 2 bag, its folder with metadata.yaml is read as it is" if inside else ""
+        )
+        return f"{archive}: is an archive; unpack it, and give what it holds{folder}"
+    counts = Counter(file.suffix.lower() for file in files)
+    suffix = max(_OTHER_IMAGES, key=lambda suffix: counts[suffix])
+    if not counts[suffix]:
+        return None
+    return (
+        f"{path}: holds {counts[suffix]} files {suffix}, which are not read; write the images as PNG, "
+        "JPEG, BMP, TIFF, PGM, PPM or WebP"
     )

@@ -354,6 +354,10 @@ def _read_table(path: Path) -> _Table:
             rows.append(line.rstrip(",;").rstrip())
             line_numbers.append(number)
     first = rows[0] if rows else ""
+    cells = split_cells(first)
+    if "," in first and re.search(r"[;\t]", first) and all(map(_is_number, cells)):
+        rows = [";".join(split_cells(row)) for row in rows]  # decimal commas
+        return _Table(path, comments, rows, line_numbers, ";")
     separator = "," if "," in first else ";" if ";" in first else None
     return _Table(path, comments, rows, line_numbers, separator)
 

@@ -35,7 +35,7 @@ ACCEL_UNITS: Mapping[str, float] = {
     **dict.fromkeys(("m/s2", "m/s/s", "mps2", "mpss", "ms2", "m_s2", "m_s_2", "meter/s2"), 1.0),
     **dict.fromkeys(("m/s",), 1.0),  # a spelling without its square
     **dict.fromkeys(("g", "gs", "gn", "g0", "gee"), _GRAVITY),
-    **dict.fromkeys(("mg", "millig", "milli_g"), 1e-3 * _GRAVITY),
+    **dict.fromkeys(("mg", "millig", "milli_g", "milli-g"), 1e-3 * _GRAVITY),
     **dict.fromkeys(("cm/s2", "cm_s2", "cmps2", "cms2", "gal"), 1e-2),
     **dict.fromkeys(("mm/s2", "mm_s2", "mmps2", "mms2"), 1e-3),
 }

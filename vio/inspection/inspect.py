@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -16,6 +17,7 @@ from vio.filters.stereo_calibration import VerticalDisparityModel
 from vio.findings import Finding
 from vio.geometry.rectify import field_of_view
 from vio.geometry.stereo import StereoCamera
+from vio.guard.pairing import find_delay
 from vio.guard.repairing import late_text
 from vio.imu.clocks import judge_clocks
 from vio.imu.findings import InertialFinding
@@ -47,6 +49,8 @@ class _LookedAt(NamedTuple):
 
     max_tracked: int = 200
     video_frames: int = 300  # of a video, which can only be decoded in order
+    windows: int = 6  # spread over the recording, whose pairs may be of different times
+    window_frames: int = 8
 
 
 _LOOKED_AT = _LookedAt()
@@ -79,6 +83,8 @@ def inspect_recording(
         elif recording.camera.kind == "stereo":
             stereo, off = rows_part(frames, _rectifier(dataset))
             parts.append(stereo)
+    if recording.has_images and recording.camera.kind == "stereo":
+        parts += _pairs_parts(dataset, frames_seen)
     parts += _motion_parts(dataset, span, times_ns)
     if recording.has_images and tracked > 1 and frames_seen:
         tracked = _frames_to_track(recording, times_ns, tracked)
@@ -141,9 +147,7 @@ def _spread(
     dataset: Dataset, of: range, pairs: int, progress: Callable[[int, int], None]
 ) -> list[StereoFrame]:
     """Read some frames, spread over a range."""
-    last = of[-1]
-    if dataset.recording.kind == "video":
-        last = min(last, of[0] + _LOOKED_AT.video_frames - 1)
+    last = _last_looked_at(dataset, of)
     chosen = np.unique(np.linspace(of[0], last, pairs).astype(int)).tolist()
     frames: list[StereoFrame] = []
     unusable: DataError | None = None
@@ -157,6 +161,38 @@ def _spread(
     if unusable is not None and not frames:
         raise unusable
     return frames
+
+
+def _pairs_parts(dataset: Dataset, of: range) -> list[Part]:
+    """Name pairs of different times that do not begin with the first frame, as where a camera lost
+    images and numbered on.
+    """
+    if len(of) <= _LOOKED_AT.window_frames:
+        return []
+    last = _last_looked_at(dataset, of) + 1 - _LOOKED_AT.window_frames
+    apart: dict[int, int] = {}
+    for first in np.linspace(of[0], last, _LOOKED_AT.windows).astype(int).tolist():
+        with contextlib.suppress(DataError):
+            events = dataset.events(first, first + _LOOKED_AT.window_frames)
+            frames = [event for event in events if isinstance(event, StereoFrame)]
+            delay = find_delay(frames, dataset.recording.camera)
+            if delay is not None:
+                apart[first] = delay
+    if len(set(apart.values())) < 2:  # of one delay throughout, tracking says more
+        return []
+    first, delay = next((first, delay) for first, delay in apart.items() if delay)
+    fault = (
+        f"about frame {first} {late_text(delay)}, and elsewhere not: a camera has lost images; pair "
+        "the images by their times of exposure"
+    )
+    return [Part("pairs", "of different times in a part", {"shifted_from": first}, [fault])]
+
+
+def _last_looked_at(dataset: Dataset, of: range) -> int:
+    """Return the last frame of a range that is read, as a video can only be decoded in order."""
+    if dataset.recording.kind == "video":
+        return min(of[-1], of[0] + _LOOKED_AT.video_frames - 1)
+    return of[-1]
 
 
 def _motion_parts(dataset: Dataset, span: tuple[int, int | None], times_ns: IntArray) -> list[Part]:

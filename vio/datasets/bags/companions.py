@@ -12,10 +12,11 @@ from vio.cameras.rig import Rig
 from vio.datasets.bags.frames import add_frames_of_tf, rig_with_baseline, states_baseline
 from vio.datasets.bags.index import BagIndex, index_bag, info_topic
 from vio.datasets.bags.kinds import bag_files
+from vio.datasets.bags.pictures import gray_of
 from vio.datasets.bags.store import Bag, Topic
-from vio.datasets.bags.topics import Roles, choose
+from vio.datasets.bags.topics import Roles, choose, without_transport
 from vio.datasets.companions import check_overlap, imu_on_camera_clock
-from vio.datasets.images import UnreadableImageError, decode_gray
+from vio.datasets.images import UnreadableImageError
 from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.rigs.camera_info import CameraInfo, rig_from_camera_infos
 from vio.datasets.samples import MotionSamples, in_time_order
@@ -93,7 +94,7 @@ def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
     """
     for count, message in enumerate(bag.messages([topic.name])):
         try:
-            image = decode_gray(bytes(bag.decoded(message).data), topic.name)
+            image = gray_of(bag.decoded(message), topic.name, compressed=True)
         except UnreadableImageError:
             if count > 4:
                 return None
@@ -182,7 +183,7 @@ def _with_static_pose(rig: Rig, found: Contents) -> Rig:
 
 def _is_rectified(topic: Topic) -> bool:
     """Return whether a topic's name says that its images are those after ROS's rectification."""
-    return "rect" in topic.name.removesuffix("/compressed").rsplit("/", 1)[-1]
+    return "rect" in without_transport(topic.name).rsplit("/", 1)[-1]
 
 
 def motion_of(

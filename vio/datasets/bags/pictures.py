@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+import struct
+import zlib
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -34,15 +38,62 @@ def gray_of(
         UnreadableImageError: the pixels are truncated or do not decode.
         DataError: the encoding is not read.
     """
-    if compressed:
+    if compressed and is_packed(fields):
+        fields = unpacked(fields, where)
+    elif compressed:
         return decode_gray(bytes(fields.data), where, levels, colour=colour)
     return to_8_bits(raw_gray(fields, where, colour=colour), levels)
+
+
+# height, width, whether big-endian, bytes a row, and length of the encoding that follows
+_PACKED = struct.Struct("<IIBII")
+_ZSTD_START = b"\x28\xb5\x2f\xfd"
+
+
+def is_packed(fields: Any) -> bool:
+    """Return whether a CompressedImage is a raw one of `zstd_image_transport`."""
+    return str(fields.format).strip() == "zstd"
+
+
+def unpacked(fields: Any, where: str) -> Any:
+    """Return the fields of a sensor_msgs/Image that `zstd_image_transport` packed.
+
+    Its name is that of its later versions' compression; that of earlier ones is gzip.
+
+    Reference: image_transport_plugins, zstd_publisher.cpp.
+
+    Raises:
+        UnreadableImageError: the message is truncated or damaged.
+    """
+    data = bytes(fields.data)
+    try:
+        height, width, big, step, length = _PACKED.unpack_from(data)
+        encoding = data[_PACKED.size : _PACKED.size + length].decode("ascii")
+        pixels = _decompressed(data[_PACKED.size + length :])
+    except (struct.error, zlib.error, UnicodeDecodeError) as error:
+        raise UnreadableImageError(f"{where}: does not decompress ({error})") from error
+    return SimpleNamespace(
+        encoding=encoding, height=height, width=width, is_bigendian=big, step=step, data=pixels
+    )
+
+
+def _decompressed(data: bytes) -> bytes:
+    if not data.startswith(_ZSTD_START):
+        return zlib.decompress(data, zlib.MAX_WBITS | 32)  # gzip or zlib, by its header
+    # Python's own, or that of a package, as rosbags takes it
+    zstd: Any = vars(importlib.import_module("rosbags.rosbag2.reader"))["zstd"]
+    try:
+        return bytes(zstd.decompress(data))
+    except zstd.ZstdError as error:
+        raise zlib.error(str(error)) from error
 
 
 def band_of_message(fields: Any, where: str, *, compressed: bool) -> Band | None:
     """Return the band of levels of a 16-bit image; None: it has 8 bits, or is damaged."""
     try:
-        if compressed:
+        if compressed and is_packed(fields):
+            fields = unpacked(fields, where)
+        elif compressed:
             return band_in(bytes(fields.data), where)
         return band_of(raw_gray(fields, where)) if "16" in str(fields.encoding) else None
     except UnreadableImageError:

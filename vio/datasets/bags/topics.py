@@ -42,7 +42,8 @@ _SIDES = (
     ("fisheye1", "fisheye2"), ("fisheye_1", "fisheye_2"), ("Fisheye_1", "Fisheye_2"),
     ("cam_0", "cam_1"), ("cam1", "cam2"), ("image_0", "image_1"), ("0", "1"),
 )  # fmt: skip
-_TRANSPORT = "/compressed"  # what image_transport appends to the topic of the raw images
+# what image_transport appends to the topic of the raw images
+_TRANSPORTS = re.compile(r"/(?:compressed|zstd)$")
 # share of the other's messages that raw images must have, to be taken in the place of compressed
 # ones
 _WHOLE = 0.9
@@ -243,11 +244,16 @@ def _one_camera(images: Sequence[Topic]) -> tuple[Topic | None, list[str]]:
     """Return the topic of the only camera and its others, as one may be recorded raw and
     compressed; None: several.
     """
-    if len({t.name.removesuffix(_TRANSPORT) for t in images}) != 1:
+    if len({without_transport(t.name) for t in images}) != 1:
         return None, []
     most = max(t.count for t in images)
     best = min((t for t in images if t.count > _WHOLE * most), key=_rank)
     return best, [t.name for t in images if t != best]
+
+
+def without_transport(name: str) -> str:
+    """Return the topic of the raw images that a topic's are compressed of, or the topic itself."""
+    return _TRANSPORTS.sub("", name)
 
 
 def _rank(topic: Topic) -> tuple[int, int, int]:

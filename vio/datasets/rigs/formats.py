@@ -5,6 +5,7 @@ file here and a line in `_FORMATS`.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -200,6 +201,12 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
     for fits, read in _FORMATS:
         if fits(entries):
             return read(Source(path, entries, image_size, cameras))
+    named = [name for name in entries if re.fullmatch(r"cam(era)?_?\d", name)]
+    if named and "cam0" not in entries:
+        raise CalibrationError(
+            f"{path}: names its cameras {', '.join(named)}; Kalibr's are cam0 (left) and cam1: name "
+            "them so"
+        )
     raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
 
 

@@ -150,8 +150,8 @@ def _size_doubt(camera: CameraModel, where: Path | str) -> str | None:
     if not (scaled or cropped):
         return _size_note(ratios, camera, where)
     remedy = (
-        f"if they were scaled, divide its focal lengths and principal points by "
-        f"{ratios.mean():.3g}, or all depths are off by this factor"
+        f"if they were scaled, divide its focal lengths and principal points by {_factors(ratios)}, "
+        "or all depths are off by this factor"
         if scaled
         else "if they were cropped, subtract what was cut from its principal points, or directions "
         "are off"
@@ -162,6 +162,13 @@ def _size_doubt(camera: CameraModel, where: Path | str) -> str | None:
         f"{2 * camera.cv:.0f} pixels, not of {camera.width} x {camera.height}; it is read as that "
         f"of these images; {remedy}"
     )
+
+
+def _factors(ratios: FloatArray) -> str:
+    """Return the factor of both axes, or one for each where they differ, as of stretched images."""
+    if ratios.max() <= _IMAGE_SIZE.scaled_ratio * ratios.min():
+        return f"{ratios.mean():.3g}"
+    return f"{ratios[0]:.3g} along x and {ratios[1]:.3g} along y"
 
 
 def unit_doubt(baseline: float, where: Path | str) -> str | None:
