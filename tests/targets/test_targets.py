@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -320,6 +321,36 @@ def test_calibrates_a_pair_within_the_stated_sigmas(flaws: Flaws) -> None:
     assert abs(_depth_error(fit)) < 0.002
     assert np.abs(fit.bow - flaws.bow_m).max() < 1e-4
     assert found.sigma_px == pytest.approx([0.05, 0.05], rel=0.1)
+
+
+def test_weighs_images_by_how_accurate_their_corners_are() -> None:
+    """Blurred views beside sharp ones leave what the sharp ones show."""
+    views = made_views(6, 24)
+    rng = np.random.default_rng(6)
+    blurred = [
+        replace(view, corners=tuple(_with_noise(one, 0.4, rng) for one in view.corners))
+        for view in views[::2]
+    ]
+    start = RigFit(
+        (LEFT, RIGHT), np.stack([np.eye(4), T_RIGHT_LEFT]), np.zeros((0, 4, 4)), np.zeros(2)
+    )
+    alone = _adjusted_from(start, views[1::2])
+    both = _adjusted_from(start, [*blurred, *views[1::2]])
+    assert np.percentile(both.corner_sigma_px, [25, 75]) == pytest.approx([0.05, 0.4], rel=0.15)
+    sigma = np.sqrt(np.diag(both.covariance))
+    assert (sigma < 1.15 * np.sqrt(np.diag(alone.covariance))).all()
+    error = shared_difference(both.at, _truth(both.at, Flaws()))
+    assert float(error @ np.linalg.solve(both.covariance, error)) < chi_square_quantile(0.999, 24)
+
+
+def _with_noise(corners: Corners, sigma_px: float, rng: np.random.Generator) -> Corners:
+    return replace(corners, uv=corners.uv + sigma_px * rng.normal(size=corners.uv.shape))
+
+
+def _adjusted_from(start: RigFit, views: list[View]) -> Adjusted:
+    seen = sightings(views, GRID.points_m)
+    poses = np.stack([T for T in poses_of(LEFT, seen.of_camera(0)) if T is not None])
+    return BoardAdjustment(seen).solve(replace(start, T_cam0_board=poses))
 
 
 def _truth(fit: RigFit, flaws: Flaws) -> RigFit:

@@ -1,9 +1,11 @@
 """Bundle adjustment of a board: lenses, the pair's pose, the bow of the board, and each view's pose.
 
 One robust least-squares problem over all views and cameras. Its normal equations are arrow-shaped:
-the poses of the views are eliminated (Schur complement), which leaves some thirty unknowns.
+the poses of the views are eliminated (Schur complement), which leaves some thirty unknowns. Corners
+of a far, tilted or blurred board are less accurate: each image has a standard deviation of its own.
 References: Triggs et al., Bundle adjustment: a modern synthesis (2000); Geman & McClure,
-Statistical methods for tomographic image reconstruction (1987), for the weights.
+Statistical methods for tomographic image reconstruction (1987), for the weights; Förstner, Ein
+Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten (1979), for the images' variances.
 """
 
 from __future__ import annotations
@@ -46,6 +48,8 @@ class _CornerWeights(NamedTuple):
     min_sigma_px: float = 0.01
     min_used: int = 4  # corners of a view
     behind_px: float = 100.0  # residual of a corner that the lens cannot project
+    # of the camera's usual image: how many count with those of an image for its variance
+    usual_corners: float = 5.0
 
 
 _WEIGHTS = _CornerWeights()
@@ -79,6 +83,7 @@ class Adjusted:
 
     at: RigFit
     sigma_px: FloatArray  # (C,) of a corner's coordinate, of each camera, as its residuals show
+    corner_sigma_px: FloatArray  # (R,) of each corner's coordinate, as its image's residuals show
     covariance: FloatArray  # (S, S) of the shared unknowns, see `Layout`
     used: BoolArray  # (R,) corners with weight
     residuals_px: FloatArray  # (R, 2) measured minus expected
@@ -134,6 +139,7 @@ class BoardAdjustment:
         self.seen = seen.take(order)
         self._order = order
         self._first = np.searchsorted(self.seen.view, np.arange(seen.views + 1))
+        self._image = self.seen.view * seen.cameras + self.seen.camera
         self._shape = bow_shape(seen.points_m)
         self._fixed = fixed_lenses  # and the pair and the bow: only the views' poses are found
         self._bow_sigma_m = _PRIORS.bow_share * float(np.ptp(seen.points_m, axis=0).max())
@@ -157,30 +163,32 @@ class BoardAdjustment:
         at = self._descend(start, steps, cut=False)
         at = self._descend(at, steps, cut=True)
         r = self._residuals(at)
-        used = self._weights(r, self._sigmas(r), cut=True) > 0
+        used = self._weights(r, cut=True) > 0
         # A view with fewer corners has no pose.
         used &= np.bincount(self.seen.view, used)[self.seen.view] >= _WEIGHTS.min_used
         sigma = self._final_sigmas(r, used)
-        weight = used / sigma[self.seen.camera] ** 2
+        corner_sigma = self._by_image(self._image_squares(r, used), used, sigma)
+        weight = used / corner_sigma**2
         A, B, C, _, _ = self._normal(at, weight)
         S = C - np.einsum("vij,vik->jk", B, np.linalg.solve(A, B))
         covariance = np.zeros_like(S) if self._fixed else np.asarray(np.linalg.inv(S))
         back = np.argsort(self._order)
-        return Adjusted(at, sigma, 0.5 * (covariance + covariance.T), used[back], r[back])
+        covariance = 0.5 * (covariance + covariance.T)
+        return Adjusted(at, sigma, corner_sigma[back], covariance, used[back], r[back])
 
     def pose_information(self, found: Adjusted) -> tuple[FloatArray, FloatArray]:
         """Return what is known of xi in `exp(xi) T_cam0_board` of each view: its inverse covariance
         (V, 6, 6), lenses and pair as known, and its derivative (V, 6, S) by these, see `Layout`.
         """
         used = found.used[self._order]
-        A, B, _, _, _ = self._normal(found.at, used / found.sigma_px[self.seen.camera] ** 2)
+        A, B, _, _, _ = self._normal(found.at, used / found.corner_sigma_px[self._order] ** 2)
         return np.asarray(A), np.asarray(-np.linalg.solve(A, B))
 
     def _descend(self, at: RigFit, steps: int, *, cut: bool) -> RigFit:
         damping = 1e-4
         for _ in range(steps):
             r = self._residuals(at)
-            weight = self._weights(r, self._sigmas(r), cut=cut)
+            weight = self._weights(r, cut=cut)
             before = self._cost(r, weight, at)
             system = self._normal(at, weight)
             while True:
@@ -235,14 +243,48 @@ class BoardAdjustment:
             out[c] = max(float(np.sqrt(np.sum(r[rows] ** 2) / freedom)), _WEIGHTS.min_sigma_px)
         return out
 
-    def _weights(self, r: FloatArray, sigma: FloatArray, *, cut: bool) -> FloatArray:
-        """Weights (R,) of squared residuals: Geman and McClure's, or all or nothing."""
-        squared = np.sum(r**2, axis=1) / sigma[self.seen.camera] ** 2
+    def _image_medians(self, r: FloatArray) -> FloatArray:
+        """Robust variance (R,) of a coordinate in the image of each corner, its pose as known."""
+        length = np.linalg.norm(r, axis=1)
+        order = np.lexsort((length, self._image))
+        _, first, image, count = np.unique(
+            self._image[order], return_index=True, return_inverse=True, return_counts=True
+        )
+        middle = 0.5 * (length[order[first + (count - 1) // 2]] + length[order[first + count // 2]])
+        out = np.empty(len(length))
+        out[order] = (middle / _MEDIAN_TO_SIGMA)[image] ** 2
+        return out
+
+    def _image_squares(self, r: FloatArray, used: BoolArray) -> FloatArray:
+        """Mean square (R,) of the used coordinates in the image of each corner."""
+        total = np.bincount(self._image, used * np.sum(r**2, axis=1))
+        count = np.bincount(self._image, used)
+        return np.asarray((0.5 * total / np.maximum(count, 1))[self._image])
+
+    def _by_image(self, variance: FloatArray, used: BoolArray, usual: FloatArray) -> FloatArray:
+        """Standard deviation (R,) of a coordinate by the variance in its image (R,), freed of the
+        pose, and by that of its camera's usual image (C,), which holds an image of few corners.
+        """
+        count = np.bincount(self._image, used)[self._image]
+        freedom = np.maximum(2 * count - _POSE / self.seen.cameras, 1)
+        weight = freedom / (freedom + 2 * _WEIGHTS.usual_corners)
+        own = np.maximum(np.sqrt(variance * 2 * count / freedom), _WEIGHTS.min_sigma_px)
+        return np.asarray(own**weight * usual[self.seen.camera] ** (1 - weight))
+
+    def _weights(self, r: FloatArray, *, cut: bool) -> FloatArray:
+        """Weights (R,) of squared residuals: Geman and McClure's with one standard deviation for
+        each camera, as a start may fit images differently, or all or nothing with one for each
+        image.
+        """
+        sigma = self._sigmas(r)
         if cut:
-            robust = (squared < _WEIGHTS.cut_sigmas**2).astype(np.float64)
-        else:
-            robust = 1 / (1 + squared / _WEIGHTS.quarter_sigmas**2) ** 2
-        return np.asarray(robust / sigma[self.seen.camera] ** 2)
+            every = np.ones(len(r), dtype=bool)
+            variance = self._by_image(self._image_medians(r), every, sigma) ** 2
+            squared = np.sum(r**2, axis=1) / variance
+            return np.asarray((squared < _WEIGHTS.cut_sigmas**2) / variance)
+        variance = sigma[self.seen.camera] ** 2
+        squared = np.sum(r**2, axis=1) / variance
+        return np.asarray(1 / (1 + squared / _WEIGHTS.quarter_sigmas**2) ** 2 / variance)
 
     def _cost(self, r: FloatArray, weight: FloatArray, at: RigFit) -> float:
         prior = 0.0
