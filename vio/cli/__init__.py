@@ -190,10 +190,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     for library in ("matplotlib", "numba"):  # thousands of lines at the level of --debug
         logging.getLogger(library).setLevel(logging.WARNING)
     try:
-        shown = argv is None and not getattr(args, "quiet", False)  # no caller from Python
-        with _orderly_end(), SilenceBroken(f"vio {args.command}") if shown else nullcontext():
+        with _orderly_end():
             _check_address_space(args.command)
-            status: int = args.execute(args)
+            called = argv is not None  # from Python
+            silent = called or args.command in _LIGHT or getattr(args, "quiet", False)
+            with nullcontext() if silent else SilenceBroken(f"vio {args.command}"):
+                status: int = args.execute(args)
             sys.stdout.flush()
     except StoppedError as stop:
         print(printable(" ".join(str(stop).split())), file=sys.stderr)

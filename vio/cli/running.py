@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import shlex
@@ -302,17 +303,23 @@ def _process(
     span = recording.frame_times_ns[: request.stop]
     frames = int((used_frames(span, config.dataset.max_frame_rate) >= request.start).sum())
     annotated = AnnotatedImage(frames)
-    viewers: list[Viewer] = []
-    if shown.progress:
-        viewers.append(ProgressViewer(frames, f"running {recording.path.name}"))
-    viewers.append(annotated)
+    viewers: list[Viewer] = [annotated]
     view = None if shown.view is None else _open_view(shown.view, dataset, config, truth)
     if view is not None:
         viewers.append(view)
     parts = _own_parts(request, recording, config)
     beside: tuple[Part, ...] = ("filter",) if recording.camera.kind == "stereo" else ()
     motion = _likely_motion(recording, config)
-    with locked_folder(folder), compiled_beside(beside, motion), StopRequest() as asked:
+    with (
+        locked_folder(folder),
+        compiled_beside(beside, motion),
+        StopRequest() as asked,
+        contextlib.ExitStack() as bar,
+    ):
+        if shown.progress:
+            progress = ProgressViewer(frames, f"running {recording.path.name}")
+            bar.callback(progress.close)
+            viewers.insert(0, progress)
         try:
             result = run(
                 dataset,

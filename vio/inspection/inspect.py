@@ -75,7 +75,7 @@ def inspect_recording(
         if recording.camera.kind == "rgbd":
             parts.append(depths_part(frames))
         elif recording.camera.kind == "stereo":
-            stereo, off = rows_part(frames)
+            stereo, off = rows_part(frames, progress)
             parts.append(stereo)
     parts += _motion_parts(dataset, span, times_ns)
     if recording.has_images and tracked > 1 and frames_seen:

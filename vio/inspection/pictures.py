@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -157,13 +157,17 @@ def depths_part(frames: Sequence[StereoFrame]) -> Part:
     )
 
 
-def rows_part(frames: Sequence[StereoFrame]) -> tuple[Part, StereoError | None]:
+def rows_part(
+    frames: Sequence[StereoFrame], progress: Callable[[int, int], None]
+) -> tuple[Part, StereoError | None]:
     """Describe how the rows of left and right images agree, by SIFT matches that assume nothing
     of the calibration, and what they say of it; None: nothing.
     """
-    matches = [
-        sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None
-    ]
+    matches = []
+    for done, f in enumerate(frames):
+        if f.left is not None and f.right is not None:
+            matches.append(sift_pairs(f.left, f.right))
+        progress(len(frames) + done + 1, 2 * len(frames))  # they were read before
     counts = list(map(len, matches))
     z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _PICTURES.min_matches)])
     found = row_residuals(z, *_size_of_images(frames))
