@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,6 +18,7 @@ import pytest
 
 import vio.filters.track_loops
 import vio.frontend.align
+from tests.commands import wait_for
 from vio.cli import waiting
 from vio.cli.output import ProgressBar
 from vio.cli.stopping import StopRequest
@@ -188,19 +189,15 @@ def test_one_count_is_of_all_processes_that_compile(
     progress = compiling.Progress()
     monkeypatch.setattr(compiling, "PROGRESS", progress)
     monkeypatch.setattr(compiling, "_LINE_S", 0.0)
+
+    def counts() -> list[int]:
+        return [int(line.split()[3]) for line in caplog.messages if ", once: " in line]
+
     with caplog.at_level(NOTE), compiled_beside(("frontend", "filter"), "imu"):
-        assert _becomes_true(lambda: progress.compiled == 6)
-    counts = [int(line.split()[3]) for line in caplog.messages if ", once: " in line]
-    assert sorted(counts) == [1, 2, 3, 4, 5, 6]
+        wait_for(lambda: len(counts()) == 6)
+    assert sorted(counts()) == [1, 2, 3, 4, 5, 6]
     progress.compiled = compiling.USUAL_LOOPS + 1
     assert progress.line() == f"compiling loops, once: {compiling.USUAL_LOOPS + 1}"
-
-
-def _becomes_true(condition: Callable[[], bool]) -> bool:
-    end_s = time.monotonic() + 20.0
-    while not condition() and time.monotonic() < end_s:
-        time.sleep(0.01)
-    return condition()
 
 
 def test_a_silent_wait_gets_a_line_that_says_what_goes_on(
@@ -208,13 +205,11 @@ def test_a_silent_wait_gets_a_line_that_says_what_goes_on(
 ) -> None:
     monkeypatch.setattr(waiting, "_LINES", waiting._LineRules(0.05, 0.0))
     with caplog.at_level(NOTE), SilenceBroken("vio run"):
-        assert _becomes_true(lambda: any(m.startswith("vio run, ") for m in caplog.messages))
+        wait_for(lambda: any(m.startswith("vio run, ") for m in caplog.messages))
         with ProgressBar("running x", 3, unit="frames"):
-            assert _becomes_true(
-                lambda: any("running x: 0 of 3 frames, " in m for m in caplog.messages)
-            )
+            wait_for(lambda: any("running x: 0 of 3 frames, " in m for m in caplog.messages))
             with stage("drawing"):
-                assert _becomes_true(lambda: any("drawing, " in m for m in caplog.messages))
+                wait_for(lambda: any("drawing, " in m for m in caplog.messages))
     said = len(caplog.messages)
     time.sleep(0.2)
     assert len(caplog.messages) == said  # it ends with the block
