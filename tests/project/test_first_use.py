@@ -22,7 +22,7 @@ from tests.commands import wait_for
 from vio.cli import waiting
 from vio.cli.output import ProgressBar
 from vio.cli.stopping import StopRequest
-from vio.cli.waiting import SilenceBroken, line_due, stage
+from vio.cli.waiting import SilenceBroken, line_due, stage, working
 from vio.errors import NOTE
 from vio.live import first_use
 from vio.live.first_use import Part, compile_part, compiled_beside
@@ -210,6 +210,11 @@ def test_a_silent_wait_gets_a_line_that_says_what_goes_on(
             wait_for(lambda: any("running x: 0 of 3 frames, " in m for m in caplog.messages))
             with stage("drawing"):
                 wait_for(lambda: any("drawing, " in m for m in caplog.messages))
+                with working(lambda: None):  # as a server does
+                    time.sleep(0.1)
+                    said = len(caplog.messages)
+                    time.sleep(0.2)
+                    assert len(caplog.messages) == said
     said = len(caplog.messages)
     time.sleep(0.2)
     assert len(caplog.messages) == said  # it ends with the block

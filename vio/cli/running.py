@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from vio.cli.output import ProgressBar
 from vio.cli.stopping import StopRequest
+from vio.cli.waiting import working
 from vio.config import Config, load_config
 from vio.dataclass import dataclass
 from vio.datasets import open_dataset
@@ -415,7 +416,8 @@ def _leave_view(view: RerunViewer, result: RunResult) -> None:
     if view.address is not None and result.stopped is None:
         from vio.view.stream import wait_for_interrupt
 
-        wait_for_interrupt(view.address)
+        with working(lambda: None):  # until it is interrupted: a silence is no wait
+            wait_for_interrupt(view.address)
 
 
 def _own_parts(request: RunRequest, recording: Recording, config: Config) -> Parts:
