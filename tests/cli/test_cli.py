@@ -19,7 +19,7 @@ import pytest
 
 from tests.commands import json_of, refused
 from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_kitti, make_npz
-from vio.cli import build_parser, main
+from vio.cli import build_parser, main, waiting
 from vio.config import BASIC, Config, describe
 from vio.errors import NOTE, DataError
 from vio.files.trajectories import read_trajectory, write_tum
@@ -410,6 +410,7 @@ def test_reports_and_skips_truncated_images_up_to_a_limit(
     assert main(["report", str(tmp_path / "out")]) == 0
     assert "5 of 6 frames" in (tmp_path / "out" / "report.html").read_text()
     assert "000003.png" in refused(capsys, *run, "--set", "dataset.max_bad_frames=0")
+    assert not waiting._WORK, "a run that failed has closed its bar"
 
 
 def test_an_interrupt_while_the_picture_is_drawn_costs_the_picture_alone(

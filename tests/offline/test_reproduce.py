@@ -63,7 +63,12 @@ def test_the_papers_figures_are_drawn_beside_ours(
         truth = tmp_path / "truth.tum"
         times_ns = open_dataset(file).recording.frame_times_ns
         write_tum(truth, Trajectory(drive.T_world_imu, times_ns, "imu"))
-    reproduce(file, truth, tmp_path / "out")
+    said: list[str] = []
+    reproduce(file, truth, tmp_path / "out", said.append)
+    count = len(needed)
+    assert [line.partition(":")[0] for line in said] == [
+        f"0027, {k} of {count}" for k in range(1, count + 1)
+    ]
     sizes = [
         (tmp_path / "out" / "0027" / f"{name}.png").stat().st_size
         for name in ("trajectories", *(name for name, _, _ in FIGURES))

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,10 +18,11 @@ import pytest
 
 import vio.filters.track_loops
 import vio.frontend.align
+from tests.commands import wait_for
 from vio.cli import waiting
 from vio.cli.output import ProgressBar
 from vio.cli.stopping import StopRequest
-from vio.cli.waiting import SilenceBroken, line_due, stage
+from vio.cli.waiting import SilenceBroken, line_due, stage, working
 from vio.errors import NOTE
 from vio.live import first_use
 from vio.live.first_use import Part, compile_part, compiled_beside
@@ -112,8 +113,9 @@ def helpers(monkeypatch: pytest.MonkeyPatch) -> list[_Helper]:
 
 
 def test_each_part_is_compiled_beside_and_waited_for(
-    helpers: list[_Helper], caplog: pytest.LogCaptureFixture
+    helpers: list[_Helper], caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(compiling, "PROGRESS", compiling.Progress())  # says nothing at first
     with caplog.at_level(NOTE), compiled_beside(("frontend", "filter"), "imu"):
         assert compiling.before_first_call is not None
         with compiled_beside(("filter",), "imu"):  # as a run inside a demo
@@ -187,19 +189,15 @@ def test_one_count_is_of_all_processes_that_compile(
     progress = compiling.Progress()
     monkeypatch.setattr(compiling, "PROGRESS", progress)
     monkeypatch.setattr(compiling, "_LINE_S", 0.0)
+
+    def counts() -> list[int]:
+        return [int(line.split()[3]) for line in caplog.messages if ", once: " in line]
+
     with caplog.at_level(NOTE), compiled_beside(("frontend", "filter"), "imu"):
-        assert _becomes_true(lambda: progress.compiled == 6)
-    counts = [int(line.split()[3]) for line in caplog.messages if ", once: " in line]
-    assert sorted(counts) == [1, 2, 3, 4, 5, 6]
+        wait_for(lambda: len(counts()) == 6)
+    assert sorted(counts()) == [1, 2, 3, 4, 5, 6]
     progress.compiled = compiling.USUAL_LOOPS + 1
     assert progress.line() == f"compiling loops, once: {compiling.USUAL_LOOPS + 1}"
-
-
-def _becomes_true(condition: Callable[[], bool]) -> bool:
-    end_s = time.monotonic() + 20.0
-    while not condition() and time.monotonic() < end_s:
-        time.sleep(0.01)
-    return condition()
 
 
 def test_a_silent_wait_gets_a_line_that_says_what_goes_on(
@@ -207,11 +205,16 @@ def test_a_silent_wait_gets_a_line_that_says_what_goes_on(
 ) -> None:
     monkeypatch.setattr(waiting, "_LINES", waiting._LineRules(0.05, 0.0))
     with caplog.at_level(NOTE), SilenceBroken("vio run"):
-        assert _becomes_true(lambda: any(m.startswith("vio run: ") for m in caplog.messages))
+        wait_for(lambda: any(m.startswith("vio run, ") for m in caplog.messages))
         with ProgressBar("running x", 3, unit="frames"):
-            assert _becomes_true(lambda: "running x: 0 of 3 frames" in caplog.messages)
+            wait_for(lambda: any("running x: 0 of 3 frames, " in m for m in caplog.messages))
             with stage("drawing"):
-                assert _becomes_true(lambda: any("drawing: " in m for m in caplog.messages))
+                wait_for(lambda: any("drawing, " in m for m in caplog.messages))
+                with working(lambda: None):  # as a server does
+                    time.sleep(0.1)
+                    said = len(caplog.messages)
+                    time.sleep(0.2)
+                    assert len(caplog.messages) == said
     said = len(caplog.messages)
     time.sleep(0.2)
     assert len(caplog.messages) == said  # it ends with the block
@@ -220,6 +223,6 @@ def test_a_silent_wait_gets_a_line_that_says_what_goes_on(
 def test_lines_become_rarer_where_the_work_takes_long() -> None:
     assert not line_due(4.0, 4.0)
     assert line_due(6.0, 6.0)
-    assert not line_due(60.0, 20.0)
-    assert line_due(60.0, 30.0)
-    assert line_due(10_000.0, 60.0)
+    assert not line_due(60.0, 11.0)
+    assert line_due(60.0, 12.0)
+    assert line_due(10_000.0, 30.0)

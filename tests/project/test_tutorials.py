@@ -127,7 +127,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     page = (site / "math.html").read_text(encoding="utf-8")
     numbers = re.findall(r"\\tag\{(\w+)\}", (ROOT / "docs" / "math.md").read_text(encoding="utf-8"))
     assert len(numbers) > 50
-    assert re.findall(r'</math><span id="\w+">\((\w+)\)</span>', page) == numbers
+    assert re.findall(r'</math></div><span id="\w+">\((\w+)\)</span>', page) == numbers
     assert "arithmatex" not in page
     assert not re.search(r'(src|href)="https?://[^"]+\.(js|css|woff2?)', page), "needs no network"
     reference = (site / "reference.html").read_text(encoding="utf-8")

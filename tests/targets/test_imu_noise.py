@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.commands import refused
 from vio.cli import main
 from vio.datasets.yaml_files import imu_densities, read_yaml_file
 from vio.errors import DataError
@@ -89,3 +90,13 @@ def test_the_command_writes_kalibrs_file(tmp_path: Path) -> None:
     assert densities is not None
     assert densities.gyro == pytest.approx(MOVING_FACTOR * 2e-4, rel=0.1)
     assert plot.stat().st_size > 10_000
+
+
+def test_a_folder_is_answered_with_the_table_in_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "give the table of IMU samples: its imu.csv" in refused(capsys, "imu-noise", tmp_path)
+    table = tmp_path / "mav0" / "imu0" / "data.csv"
+    table.parent.mkdir(parents=True)
+    table.touch()
+    assert f"samples: {table}" in refused(capsys, "imu-noise", tmp_path)

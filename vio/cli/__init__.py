@@ -61,6 +61,7 @@ _GC_OBJECTS = 100_000
 # bytes; a short run of MH_01 takes 976 MB, and OpenCV fails to load in 820
 _MIN_ADDRESS_SPACE = 1_000_000_000
 _LIGHT = ("config", "completion")  # commands that load no library
+_ENDLESS = ("live", "ros2", "play", "view")  # that go on until they are ended: a silence is no wait
 _SEE_HELP = "; vio --help lists them"
 _MAX_SHOWN = 200  # characters of a path in a message
 _ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -192,10 +193,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     for library in ("matplotlib", "numba"):  # thousands of lines at the level of --debug
         logging.getLogger(library).setLevel(logging.WARNING)
     try:
-        shown = argv is None and not getattr(args, "quiet", False)  # no caller from Python
-        with _orderly_end(), SilenceBroken(f"vio {args.command}") if shown else nullcontext():
+        with _orderly_end():
             _check_address_space(args.command)
-            status: int = args.execute(args)
+            called = argv is not None  # from Python
+            silent = called or args.command in (*_LIGHT, *_ENDLESS) or getattr(args, "quiet", False)
+            with nullcontext() if silent else SilenceBroken(f"vio {args.command}"):
+                status: int = args.execute(args)
             sys.stdout.flush()
     except StoppedError as stop:
         print(printable(" ".join(str(stop).split())), file=sys.stderr)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vio.cli.output import print_result
+from vio.errors import DataError
 
 if TYPE_CHECKING:
     from vio.targets.noise import AxisNoise, ImuNoise
@@ -37,6 +38,10 @@ def execute(args: argparse.Namespace) -> int:
     from vio.records import ImuDensities
     from vio.targets.noise import MOVING_FACTOR, measure_noise
 
+    if args.imu.is_dir():
+        tables = (args.imu / name for name in ("mav0/imu0/data.csv", "imu.csv"))
+        there = next((str(table) for table in tables if table.is_file()), "its imu.csv")
+        raise DataError(f"{args.imu}: is a folder; give the table of IMU samples: {there}")
     check_writable(args.out)
     noise = measure_noise(read_imu_table(args.imu)[0])
     at_rest = noise.densities

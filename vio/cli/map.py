@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vio.cli.output import print_result
+from vio.cli.waiting import working
 from vio.errors import ConfigError
 
 DENSITY = 10
@@ -102,7 +103,8 @@ def execute(args: argparse.Namespace) -> int:
     from vio.mapping import files
 
     if args.action == "serve":
-        return _serve(args)
+        with working(lambda: None):  # until it is interrupted: a silence is no wait
+            return _serve(args)
     if args.action == "prune" and args.density < 1:
         raise ConfigError("--density must be at least 1")
     if args.action == "merge" and not 1 <= args.workers <= 64:

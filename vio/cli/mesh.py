@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from vio.cli.output import ProgressBar, print_result
 from vio.cli.stopping import StopRequest
+from vio.cli.waiting import stage
 from vio.errors import ConfigError
 from vio.files.printable import json_text
 
@@ -88,7 +89,10 @@ def execute(args: argparse.Namespace) -> int:
             **facts_of(made_from, done),
             "seconds": time.perf_counter() - began,
         }
-        with atomic_folder(out, replace=True, marker=MeshFile.FACTS) as folder:
+        with (
+            stage("writing the mesh"),
+            atomic_folder(out, replace=True, marker=MeshFile.FACTS) as folder,
+        ):
             _write(folder, done)
             (folder / MeshFile.FACTS).write_text(
                 json_text(facts, indent=2) + "\n", encoding="utf-8"

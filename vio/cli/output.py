@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from vio.cli.waiting import line_due, working
+from vio.cli.waiting import line_due, silent_since, working
 from vio.errors import NOTE
 from vio.files.printable import json_text, printable
 
@@ -88,7 +88,9 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
     def _advance_to(self, done: int) -> None:
         self._done = done
         now_s = time.monotonic()
-        if self._bar is None and line_due(now_s - self._begun_s, now_s - self._said_s):
+        if self._bar is None and line_due(
+            now_s - self._begun_s, now_s - silent_since(self._said_s)
+        ):
             self._said_s = now_s
             log.log(NOTE, "%s", self._line())
 

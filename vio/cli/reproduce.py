@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from pathlib import Path
 from typing import Any
 
 from vio.cli.arguments import examples
+from vio.cli.waiting import working
+from vio.errors import NOTE
 from vio.files.printable import json_text
+
+log = logging.getLogger(__name__)
 
 
 def add_parser(commands: Any) -> None:
@@ -43,7 +48,15 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     from vio.offline.reproduce import reproduce
 
-    tables = [reproduce(*_split(text), args.out) for text in args.files]
+    now = "reproduce"
+
+    def say(text: str) -> None:
+        nonlocal now
+        now = text
+        log.log(NOTE, "%s", text)
+
+    with working(lambda: now):
+        tables = [reproduce(*_split(text), args.out, say) for text in args.files]
     if args.json:
         print(json_text([table.as_dict() for table in tables]))
     else:

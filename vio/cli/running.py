@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import shlex
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from vio.cli.output import ProgressBar
 from vio.cli.stopping import StopRequest
+from vio.cli.waiting import working
 from vio.config import Config, load_config
 from vio.dataclass import dataclass
 from vio.datasets import open_dataset
@@ -302,17 +304,23 @@ def _process(
     span = recording.frame_times_ns[: request.stop]
     frames = int((used_frames(span, config.dataset.max_frame_rate) >= request.start).sum())
     annotated = AnnotatedImage(frames)
-    viewers: list[Viewer] = []
-    if shown.progress:
-        viewers.append(ProgressViewer(frames, f"running {recording.path.name}"))
-    viewers.append(annotated)
+    viewers: list[Viewer] = [annotated]
     view = None if shown.view is None else _open_view(shown.view, dataset, config, truth)
     if view is not None:
         viewers.append(view)
     parts = _own_parts(request, recording, config)
     beside: tuple[Part, ...] = ("filter",) if recording.camera.kind == "stereo" else ()
     motion = _likely_motion(recording, config)
-    with locked_folder(folder), compiled_beside(beside, motion), StopRequest() as asked:
+    with (
+        locked_folder(folder),
+        compiled_beside(beside, motion),
+        StopRequest() as asked,
+        contextlib.ExitStack() as bar,
+    ):
+        if shown.progress:
+            progress = ProgressViewer(frames, f"running {recording.path.name}")
+            bar.callback(progress.close)
+            viewers.insert(0, progress)
         try:
             result = run(
                 dataset,
@@ -408,7 +416,8 @@ def _leave_view(view: RerunViewer, result: RunResult) -> None:
     if view.address is not None and result.stopped is None:
         from vio.view.stream import wait_for_interrupt
 
-        wait_for_interrupt(view.address)
+        with working(lambda: None):  # until it is interrupted: a silence is no wait
+            wait_for_interrupt(view.address)
 
 
 def _own_parts(request: RunRequest, recording: Recording, config: Config) -> Parts:

@@ -19,11 +19,19 @@ class _LineRules(NamedTuple):
     """When a line says how far the work is: soon at first, more rarely where it takes long."""
 
     least_s: float = 5.0
-    share: float = 0.5  # of the time so far
-    most_s: float = 60.0
+    share: float = 0.2  # of the time so far
+    most_s: float = 30.0
 
 
 _LINES = _LineRules()
+_said_s = time.monotonic()  # when the log said something last, while a `SilenceBroken` listens
+
+
+def silent_since(begun_s: float) -> float:
+    """Return since when work that began at a time, or the log after it, has said nothing."""
+    return max(begun_s, _said_s)
+
+
 # What goes on, the innermost last; each returns its line, or None where a bar shows it.
 _WORK: list[Callable[[], str | None]] = []
 
@@ -47,8 +55,7 @@ def working(line: Callable[[], str | None]) -> Iterator[None]:
 @contextlib.contextmanager
 def stage(text: str) -> Iterator[None]:
     """Describe silent waits inside the block."""
-    begun_s = time.monotonic()
-    with working(lambda: f"{text}: {time.monotonic() - begun_s:.0f} s so far"):
+    with working(lambda: text):
         yield
 
 
@@ -58,28 +65,28 @@ class SilenceBroken(logging.Handler):
     def __init__(self, command: str) -> None:
         super().__init__()
         self._command = command
-        self._begun_s = self._said_s = time.monotonic()
+        self._begun_s = time.monotonic()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Note that something was said."""
-        self._said_s = time.monotonic()
+        global _said_s
+        _said_s = time.monotonic()
 
     def _watch(self) -> None:
         while not self._ended.wait(_LINES.least_s / 5):
             now_s = time.monotonic()
-            if line_due(now_s - self._begun_s, now_s - self._said_s):
+            if line_due(now_s - self._begun_s, now_s - silent_since(self._begun_s)):
                 self._say()
 
     def _say(self) -> None:
-        if _WORK and (line := _WORK[-1]()) is None:
+        line = _WORK[-1]() if _WORK else self._command
+        if line is None:
             return  # a bar moves
         if PROGRESS.is_compiling:
             line = PROGRESS.line()
-        elif not _WORK:
-            line = f"{self._command}: {time.monotonic() - self._begun_s:.0f} s so far"
-        log.log(NOTE, "%s", line)
+        log.log(NOTE, "%s, %.0f s so far", line, time.monotonic() - self._begun_s)
 
     def __enter__(self) -> SilenceBroken:
         logging.getLogger().addHandler(self)

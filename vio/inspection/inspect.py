@@ -81,7 +81,7 @@ def inspect_recording(
         if recording.camera.kind == "rgbd":
             parts.append(depths_part(frames))
         elif recording.camera.kind == "stereo":
-            stereo, off = rows_part(frames, _rectifier(dataset))
+            stereo, off = rows_part(frames, _rectifier(dataset), progress)
             parts.append(stereo)
     if recording.has_images and recording.camera.kind == "stereo":
         parts += _pairs_parts(dataset, frames_seen)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -161,7 +161,9 @@ def depths_part(frames: Sequence[StereoFrame]) -> Part:
 
 
 def rows_part(
-    frames: Sequence[StereoFrame], rectifier: Rectifier | None = None
+    frames: Sequence[StereoFrame],
+    rectifier: Rectifier | None,
+    progress: Callable[[int, int], None],
 ) -> tuple[Part, StereoError | None]:
     """Describe how the rows of left and right images agree, by SIFT matches that assume nothing
     of the calibration, and what they say of it; None: nothing.
@@ -169,10 +171,13 @@ def rows_part(
     Args:
         frames: of a recording.
         rectifier: of raw images; None: they were rectified already.
+        progress: called with how many steps are done and how many there are.
     """
-    matches = [
-        sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None
-    ]
+    matches = []
+    for done, f in enumerate(frames):
+        if f.left is not None and f.right is not None:
+            matches.append(sift_pairs(f.left, f.right))
+        progress(len(frames) + done + 1, 2 * len(frames))  # they were read before
     counts = list(map(len, matches))
     z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _PICTURES.min_matches)])
     found = row_residuals(z, *_size_of_images(frames))

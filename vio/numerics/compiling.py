@@ -67,10 +67,11 @@ class Progress:
             now_s = time.monotonic()
             due = now_s - self._said_s >= _LINE_S
             self._said_s = now_s if due else self._said_s
+            line = self.line()
         if counted_by is not None:
             counted_by()
         elif due:
-            log.log(_level(), "%s", self.line())
+            log.log(_level(), "%s", line)
 
     def line(self) -> str:
         """Return how many loops were compiled, of how many if there are not more than usual."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -143,9 +143,20 @@ class ReproducedTable:
         return "\n".join(lines) + "\n"
 
 
-def reproduce(file: Path, reference: Path | None, out: Path) -> ReproducedTable:
+def reproduce(
+    file: Path,
+    reference: Path | None,
+    out: Path,
+    say: Callable[[str], None] = lambda text: None,
+) -> ReproducedTable:
     """Run every variant on one ECE276A file; write `out/DRIVE/` with a table and four figures:
     all paths, and the paper's three, each beside ours.
+
+    Args:
+        file: of the course.
+        reference: ground truth; None: that of the file, where it has one.
+        out: folder.
+        say: gets a line before each variant is run.
 
     Raises:
         VioError: a file cannot be used.
@@ -161,7 +172,8 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> ReproducedTable:
     check_writable(out / file.stem)
     results: list[tuple[Variant, RunResult, Evaluation | None]] = []
     with one_blas_thread():
-        for variant in VARIANTS:
+        for number, variant in enumerate(VARIANTS, start=1):
+            say(f"{file.stem}, {number} of {len(VARIANTS)}: {variant.name}")
             result = run(open_dataset(file, variant.dataset), variant.config)
             score = (
                 None
