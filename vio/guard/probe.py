@@ -10,7 +10,7 @@ import numpy as np
 
 from vio.frontend.detect import detect_corners
 from vio.frontend.settings import GridSettings
-from vio.frontend.stereo_match import match_rows, shifted_rows
+from vio.frontend.stereo_match import ROW_SEARCH, match_rows, shifted_rows
 from vio.geometry.lie import FloatArray
 from vio.records import Image, IntArray
 
@@ -21,18 +21,13 @@ CORNERS = 80  # that are searched, at most
 class _ProbeRules:
     """How corners are searched along rows, and when the rows are."""
 
-    max_disparity: float = 0.64  # of the image width: near scenes, too
     usual_disparity: float = 0.16  # enough to compare pairings
     min_correlation: float = 0.8
-    good_correlation: float = 0.9  # of patches whose rows agree
-    min_margin: float = 0.03  # lead over the second-best match of a row
-    min_negative_px: float = 1.0  # of a disparity that counts as negative
-    max_rows_half: int = 16  # row difference that is searched, pixels at half resolution
-    clearly: int = 2  # times as many matches at another row difference
+    clear_ratio: int = 2  # times as many matches at another row difference
 
 
-_RULES = _ProbeRules()
-_FEW = 0.2  # share of the corners with a match below which other row differences are tried
+_PROBE = _ProbeRules()
+MIN_NEGATIVE_PX = 1.0  # of a disparity that counts as negative: far points have about none
 # row differences of a camera that is pitched a little, pixels at half resolution
 _NEAR_ROWS = np.arange(-3.0, 3.1, 0.5)
 
@@ -58,10 +53,10 @@ class RowProbe:
 
     def positive(self, left: Image, right: Image, points: FloatArray) -> int:
         """Count the pixels (N, 2) of the left image that match with a positive disparity."""
-        found = self._count(left, right, points, self._rows, _RULES.min_correlation)
-        if found < _FEW * len(points) and not self._searched:
+        found = self._count(left, right, points, self._rows, _PROBE.min_correlation)
+        if found < ROW_SEARCH.few_share * len(points) and not self._searched:
             self._search(left, right, points)
-            found = self._count(left, right, points, self._rows, _RULES.min_correlation)
+            found = self._count(left, right, points, self._rows, _PROBE.min_correlation)
         return found
 
     def negative(self, left: Image, right: Image, points: FloatArray) -> int:
@@ -69,11 +64,11 @@ class RowProbe:
         mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (left, right)]
         flipped = points * [-1.0, 1.0] + [2.0 * (left.shape[1] - 1), 0.0]
         rows = shifted_rows(mirrored[1], self._rows)
-        reach = _RULES.max_disparity * 2 * left.shape[1]
+        reach = ROW_SEARCH.max_disparity * 2 * left.shape[1]
         disparity, good = match_rows(
-            mirrored[0], rows, flipped, reach, _RULES.min_correlation, _RULES.min_margin
+            mirrored[0], rows, flipped, reach, _PROBE.min_correlation, ROW_SEARCH.min_margin
         )
-        return int((good & (disparity >= _RULES.min_negative_px)).sum())
+        return int((good & (disparity >= MIN_NEGATIVE_PX)).sum())
 
     def on_rows(self, left: Image, right: Image, points: FloatArray) -> int:
         """Count the pixels (N, 2) of the left image that match well on their rows.
@@ -99,28 +94,32 @@ class RowProbe:
         return np.array(counts[0] + counts[self._rows], dtype=np.int64)
 
     def _well_matched(self, left: Image, right: Image, points: FloatArray) -> int:
-        reach = _RULES.usual_disparity * 2 * left.shape[1]
+        reach = _PROBE.usual_disparity * 2 * left.shape[1]
         return int(
-            match_rows(left, right, points, reach, _RULES.good_correlation, _RULES.min_margin)[
-                1
-            ].sum()
+            match_rows(
+                left, right, points, reach, ROW_SEARCH.good_correlation, ROW_SEARCH.min_margin
+            )[1].sum()
         )
 
     def _count(
         self, left: Image, right: Image, points: FloatArray, rows: int, correlation: float
     ) -> int:
-        reach = _RULES.max_disparity * 2 * left.shape[1]
+        reach = ROW_SEARCH.max_disparity * 2 * left.shape[1]
         other = shifted_rows(right, rows)
-        return int(match_rows(left, other, points, reach, correlation, _RULES.min_margin)[1].sum())
+        return int(
+            match_rows(left, other, points, reach, correlation, ROW_SEARCH.min_margin)[1].sum()
+        )
 
     def _search(self, left: Image, right: Image, points: FloatArray) -> None:
         """Take the row difference at which most pixels match well, where it is a clear one."""
         self._searched = True
-        tried = range(-_RULES.max_rows_half, _RULES.max_rows_half + 1)
-        counts = [self._count(left, right, points, rows, _RULES.good_correlation) for rows in tried]
+        tried = range(-ROW_SEARCH.max_rows_half, ROW_SEARCH.max_rows_half + 1)
+        counts = [
+            self._count(left, right, points, rows, ROW_SEARCH.good_correlation) for rows in tried
+        ]
         best = int(np.argmax(counts))
-        present = counts[self._rows + _RULES.max_rows_half]
-        if counts[best] >= max(_FEW * len(points), _RULES.clearly * present):
+        present = counts[self._rows + ROW_SEARCH.max_rows_half]
+        if counts[best] >= max(ROW_SEARCH.few_share * len(points), _PROBE.clear_ratio * present):
             self._rows = tried[best]
 
 
