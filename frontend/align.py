@@ -51,6 +51,8 @@ _DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured 
 INSIDE = 2.0 * _SIGMAS.window_share
 # anchors are cut at multiples of this fraction of a pixel, where the weights of float32 are exact
 _SUBPIXELS = 32
+ITERATIONS = 5  # of a feature that is followed
+MIN_CORRELATION = 0.8  # normalised, with the anchor; below, it is another patch
 FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
 
 Pixels = npt.NDArray[np.float32]  # gray levels and what is computed from them

@@ -9,7 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args, moved_pixel, turn_to
-from vio.frontend.align import align, on_peak, rounded, scale_change, shift_warps, template_points
+from vio.frontend.align import (
+    ITERATIONS,
+    MIN_CORRELATION,
+    align,
+    on_peak,
+    rounded,
+    scale_change,
+    shift_warps,
+    template_points,
+)
 from vio.frontend.detect import min_distance_px
 from vio.frontend.outliers import Consensus
 from vio.frontend.patches import ImageLevels
@@ -24,8 +33,6 @@ from vio.records import BoolArray, IntArray
 class _AnchorRules(NamedTuple):
     """When an anchor is replaced."""
 
-    iterations: int = 5
-    min_correlation: float = 0.8  # normalised, with the anchor; below, the anchor is replaced
     lost_correlation: float = 0.5  # below, the feature is lost
     max_scale: float = 1.25  # change of scale at which the anchor is replaced
 
@@ -90,11 +97,11 @@ class AnchorFit:
         slots = old.slot.take(rows)
         warp[:, :, :2] *= scale[:, None, None]
         warp[:, :, 2] = start
-        warp, score = align(self._bank.store, slots, left.full, warp, _ANCHORS.iterations)
+        warp, score = align(self._bank.store, slots, left.full, warp, ITERATIONS)
         change = scale_change(warp)
         change = np.maximum(change, 1.0 / change)
         good = (
-            (score >= _ANCHORS.min_correlation)
+            (score >= MIN_CORRELATION)
             & on_peak(warp[:, :, 2], start)
             & (change <= 2 * _ANCHORS.max_scale)
         )
@@ -157,10 +164,10 @@ class AnchorFit:
         self._bank.replace(slots, before.full, centres)
         warp = shift_warps(start + centres - pixels)
         warp[:, :, :2] *= scale[:, None, None]
-        warp, score = align(self._bank.store, slots, left.full, warp, _ANCHORS.iterations)
+        warp, score = align(self._bank.store, slots, left.full, warp, ITERATIONS)
         # The anchor was cut at a rounded pixel; correct the offset to the feature.
         warp[:, :, 2] = template_points(warp, pixels - centres)
-        return warp, (score >= _ANCHORS.min_correlation) & on_peak(warp[:, :, 2], start)
+        return warp, (score >= MIN_CORRELATION) & on_peak(warp[:, :, 2], start)
 
 
 class _Moved(NamedTuple):

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.frontend.align import (
+    MIN_CORRELATION,
     align,
     cut_patches,
     on_peak,
@@ -64,16 +65,7 @@ class _MatchRules(NamedTuple):
 
 _MATCHES = _MatchRules()
 _MAX_ROW_DIFFERENCE_PX = 1.5  # of a stereo match
-
-
-class _RefineRules(NamedTuple):
-    """How matches are refined."""
-
-    iterations: int = 6
-    min_correlation: float = 0.8
-
-
-_REFINE = _RefineRules()
+_REFINEMENTS = 6  # iterations on a match
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,7 +331,7 @@ class DescriptorFrontend:
         return make_output(frame, tracks, tracked, watch, self._scene.take_findings())
 
     # --- left and right
-    # -----------------------------------------------------------------------------------------------
+    # ----------------------------------------------------------------------------------------------
 
     def _allowed(self, left: Keypoints, right: Keypoints, width: int) -> BoolArray:
         """Pairs (N, M) near one row with a disparity in range."""
@@ -385,11 +377,9 @@ class DescriptorFrontend:
         offset = points - centres
         store = templates(cut_patches(source, centres, ANCHOR_RADIUS_PX))
         slots = np.arange(len(points))
-        warp, score = align(
-            store, slots, target, shift_warps(start - offset), _REFINE.iterations, rows
-        )
+        warp, score = align(store, slots, target, shift_warps(start - offset), _REFINEMENTS, rows)
         pixels = template_points(warp, offset)
-        good = (score >= _REFINE.min_correlation) & on_peak(pixels, start)
+        good = (score >= MIN_CORRELATION) & on_peak(pixels, start)
         return np.where(good[:, None], pixels, start), good
 
     # --- tracking in time

@@ -11,12 +11,11 @@ followed, and no new ones are found.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from vio.dataclass import dataclass
-from vio.frontend.align import align, on_peak
+from vio.frontend.align import ITERATIONS, MIN_CORRELATION, align, on_peak
 from vio.frontend.columns import take
 from vio.frontend.flow import track_with_retries
 from vio.frontend.frame_images import FrameImages
@@ -37,16 +36,7 @@ from vio.geometry.lie import (
 from vio.geometry.stereo import StereoCamera, depth_of
 from vio.records import BoolArray, Image, TrackPrior
 
-
-class _AloneRules(NamedTuple):
-    """When the right image is followed alone."""
-
-    iterations: int = 5
-    min_correlation: float = 0.8  # normalised, with the anchor
-    min_points: int = 20  # a few features that have slipped together would pass for a motion
-
-
-_ALONE = _AloneRules()
+_MIN_POINTS = 20  # a few features that have slipped together would pass for a motion
 
 
 class RightFollower:
@@ -148,10 +138,10 @@ class RightAlone:
             :, None, None
         ]
         warp[:, :, 2] = start
-        warp, score = align(bank.store, old.slot[rows], right.full, warp, _ALONE.iterations)
-        good: BoolArray = (score >= _ALONE.min_correlation) & on_peak(warp[:, :, 2], start)
+        warp, score = align(bank.store, old.slot[rows], right.full, warp, ITERATIONS)
+        good: BoolArray = (score >= MIN_CORRELATION) & on_peak(warp[:, :, 2], start)
         good &= pixel_errors(camera, T, old.point[rows], warp[:, :, 2]) <= problem.limit_px
-        if good.sum() < _ALONE.min_points:
+        if good.sum() < _MIN_POINTS:
             return None
         tracks = replace(take(old, rows), left=warp[:, :, 2].copy(), point=point, warp=warp)
         tracks = with_prior_depths(camera, take(tracks, good), prior)

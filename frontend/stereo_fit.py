@@ -12,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args, point_at
-from vio.frontend.align import MAX_MOVE_PX, align, is_on_peak
+from vio.frontend.align import ITERATIONS, MAX_MOVE_PX, MIN_CORRELATION, align, is_on_peak
 from vio.frontend.columns import changed, share_of
 from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import DisparitySettings
 from vio.frontend.stereo_match import (
     MIN_MATCH_DISPARITY_PX,
+    ROW_SEARCH,
     EpipolarRowModel,
     match_rows,
     shifted_rows,
@@ -29,25 +30,16 @@ from vio.numerics.compiled import compiled
 from vio.numerics.robust import median
 from vio.records import BoolArray, Image, IntArray
 
-_ITERATIONS = 5
-_MIN_CORRELATION = 0.8  # normalised, of a match
-
 
 class _StereoRules(NamedTuple):
     """How features are matched in the right image."""
 
-    min_peak_margin: float = 0.03  # lead in correlation over the second-best match in the row
     max_skew: float = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
     # how much lower the correlation of the coarse search may be than that of the alignment
     coarse_slack: float = 0.2
     min_depth_m: float = 0.05
     min_disparity_px: float = 0.1  # below, a point is too far away to be located
-    # share of features with a right match below which other row differences are tried
-    few_matches: float = 0.2
-    good_match: float = 0.9  # correlation of patches whose rows agree
     row_search_frames: int = 10  # between two such searches, while matches are few
-    # of the image width: largest disparity that is searched where the scene is near
-    max_reach: float = 0.64
     reach_frames: int = 10  # between two searches beyond the present reach
     # of the points without a match that must have one beyond the reach for it to be doubled …
     beyond_share: float = 0.1
@@ -55,7 +47,6 @@ class _StereoRules(NamedTuple):
     within_reach: float = 0.9  # … until this share of them is within it
     depth_slack: float = 0.1  # standard deviation of a point's depth by motion alone, over it
     min_spread_px: float = 2.0  # between near and far disparities, to tell an offset from a factor
-    max_rows_half: int = 16  # row difference, pixels at half resolution
 
 
 _STEREO = _StereoRules()
@@ -91,7 +82,7 @@ class StereoFit:
         """
         # doubled where the scene is nearer
         self.max_disparity_px = disparity.max_disparity * size[0]
-        self._most_reach_px = _STEREO.max_reach * size[0]
+        self._most_reach_px = ROW_SEARCH.max_disparity * size[0]
         self._reach_wait = 0  # frames until the reach is tried again
         self._camera = camera
         self._bank = bank
@@ -218,7 +209,7 @@ class StereoFit:
         offset = round(self._rows.offset_px / 2)
         if self._unmatched % _STEREO.row_search_frames == 1:
             offset = self._best_offset(left_half, right_half, points, offset)
-        correlation = _MIN_CORRELATION - _STEREO.coarse_slack
+        correlation = MIN_CORRELATION - _STEREO.coarse_slack
         right_half = shifted_rows(right_half, offset)
         disparity, unique = self._search(left_half, right_half, points, correlation)
         if not self._reach_wait:
@@ -248,7 +239,7 @@ class StereoFit:
         if reach >= most:
             return np.zeros(0)
         disparity, good = match_rows(
-            left_half, right_half, points, most, _STEREO.good_match, _STEREO.min_peak_margin
+            left_half, right_half, points, most, ROW_SEARCH.good_correlation, ROW_SEARCH.min_margin
         )
         return disparity[good & (disparity > reach)]
 
@@ -270,17 +261,12 @@ class StereoFit:
 
         Rows may be far apart where the right camera has been pitched since it was calibrated.
         """
-        tried = range(-_STEREO.max_rows_half, _STEREO.max_rows_half + 1)
+        tried = range(-ROW_SEARCH.max_rows_half, ROW_SEARCH.max_rows_half + 1)
         counts = [
-            int(
-                self._search(left_half, shifted_rows(right_half, rows), points, _STEREO.good_match)[
-                    1
-                ].sum()
-            )
-            for rows in tried
+            self.count_on_rows(left_half, shifted_rows(right_half, rows), points) for rows in tried
         ]
         best = int(np.argmax(counts))
-        if counts[best] < max(_ROWS.min_points, 2 * counts[offset + _STEREO.max_rows_half]):
+        if counts[best] < max(_ROWS.min_points, 2 * counts[offset + ROW_SEARCH.max_rows_half]):
             return offset
         self._rows.restart(2.0 * tried[best])
         return tried[best]
@@ -299,14 +285,15 @@ class StereoFit:
         """Count the left pixels (N, 2) that have a match with a negative disparity."""
         a, b = (np.ascontiguousarray(view.half[:, ::-1]) for view in (left, right))
         flipped = points * [-1.0, 1.0] + [2.0 * (a.shape[1] - 1), 0.0]
-        disparity, unique = self._search(a, b, flipped, _MIN_CORRELATION)
+        disparity, unique = self._search(a, b, flipped, MIN_CORRELATION)
         return int((unique & (disparity >= 1.0)).sum())
 
     def count_on_rows(self, left_half: Image, right_half: Image, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that match well on their row between two images at half
         resolution.
         """
-        return int(self._search(left_half, right_half, points, _STEREO.good_match)[1].sum())
+        good = self._search(left_half, right_half, points, ROW_SEARCH.good_correlation)[1]
+        return int(good.sum())
 
     def forget_offset(self) -> None:
         """Take nothing out of the disparities that follow but what all frames have."""
@@ -334,7 +321,7 @@ class StereoFit:
 
     def update_rows(self, tracks: Tracks) -> None:
         """Update the row differences with the matches of a frame."""
-        few = len(tracks) >= _ROWS.min_points and share_of(tracks.has_right) < _STEREO.few_matches
+        few = len(tracks) >= _ROWS.min_points and share_of(tracks.has_right) < ROW_SEARCH.few_share
         self._unmatched = self._unmatched + 1 if few else 0
         self._rows.update(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
         self._reach_wait = max(0, self._reach_wait - 1)
@@ -359,7 +346,7 @@ class StereoFit:
             points,
             self.max_disparity_px,
             min_correlation,
-            _STEREO.min_peak_margin,
+            ROW_SEARCH.min_margin,
         )
 
     def _fit(
@@ -373,7 +360,7 @@ class StereoFit:
         expected = self._rows.rows(left)
         start[:, 1, 2] = expected
         warp, score = align(
-            self._bank.store, tracks.slot.take(rows), right.full, start, _ITERATIONS, expected
+            self._bank.store, tracks.slot.take(rows), right.full, start, ITERATIONS, expected
         )
         found = _Matches(
             np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, dtype=np.bool_)
@@ -481,7 +468,7 @@ def _judge(
         du = pixels[k, 0] - fits.start[k, 0, 2]
         dv = pixels[k, 1] - fits.start[k, 1, 2]
         valid[k] = (
-            fits.score[k] >= _MIN_CORRELATION and is_on_peak(du, dv) and steep <= _STEREO.max_skew
+            fits.score[k] >= MIN_CORRELATION and is_on_peak(du, dv) and steep <= _STEREO.max_skew
         )
         valid[k] &= abs(dv) <= _MAX_ROW_DIFFERENCE_PX
         valid[k] &= MIN_MATCH_DISPARITY_PX <= fits.left[k, 0] - pixels[k, 0] <= max_disparity

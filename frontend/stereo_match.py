@@ -9,6 +9,7 @@ sub-pixel position in the full image.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +32,20 @@ _ROWS_OFF_PX = 0.2
 # the third of three like angles over the root mean square of two, at most, at 99 %
 _THIRD_ANGLE = 7.0
 
+
+class _RowSearch(NamedTuple):
+    """How features are searched along rows, and when other rows are tried."""
+
+    # of the image width: largest disparity that is searched where the scene is near
+    max_disparity: float = 0.64
+    min_margin: float = 0.03  # lead in correlation over the second-best match in the row
+    good_correlation: float = 0.9  # of patches whose rows agree
+    # share of features with a right match below which other row differences are tried
+    few_share: float = 0.2
+    max_rows_half: int = 16  # row difference, pixels at half resolution
+
+
+ROW_SEARCH = _RowSearch()
 Scores = npt.NDArray[np.float32]  # correlations, and what they are computed from
 
 

@@ -21,7 +21,7 @@ from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 
 NS_PER_S = 10**9
-S_PER_NS = 1e-9  # products with it and quotients by NS_PER_S differ in the last bit
+S_PER_NS = 1.0 / NS_PER_S  # products with it and quotients by NS_PER_S differ in the last bit
 Image: TypeAlias = npt.NDArray[np.uint8]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
@@ -588,7 +588,8 @@ class UpdateReport:
     started: bool = True  # False: nothing can be estimated yet, and the frame has no pose
     # by which the gyro's bias has jumped, rad/s, as the images show; None: it has not
     gyro_jump_radps: float | None = None
-    # by what the scale may be off, over it, as the motion sensor suggests, beside what is considered
+    # by what the scale may be off, over it, as the motion sensor suggests, beside what is
+    # considered
     scale_doubt: float = 0.0
 
 

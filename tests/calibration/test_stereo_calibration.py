@@ -27,7 +27,7 @@ from vio.cameras.rectification_error import (
     vertical_disparity_terms,
 )
 from vio.filters.multiview import (
-    _POINTS,
+    _TRIANGULATION,
     TrackInformation,
     refine_points,
     residuals,
@@ -349,7 +349,7 @@ def test_elimination_equals_the_schur_complement_with_the_coefficients_as_column
                 row = np.zeros((1, len(b)))
                 row[0, 6 * n : 6 * n + 6] = info.q.q_D_p[f, 2] @ B
                 row[0, first + 3 * f : first + 3 * f + 3] = info.q.q_D_p[f, 2]
-                N += _POINTS.disparity_information * row.T @ row
+                N += _TRIANGULATION.disparity_information * row.T @ row
     points = np.flatnonzero(np.diag(N) > 0)
     points = points[points >= first]
     K = np.linalg.solve(N[np.ix_(points, points)], N[points, :first]).T

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.plain_maker import make_plain
-from vio.datasets import open_dataset
+from vio.datasets import image_pairs, open_dataset
 from vio.datasets.bags.pictures import band_of_message, gray_of
 from vio.datasets.images import levels_in, load_gray
 from vio.datasets.levels import FULL_SCALE, Levels, band_of, is_mosaic, levels_of, to_8_bits
@@ -120,3 +120,19 @@ def test_real_gray_images_are_no_mosaics(data_dir: Path) -> None:
     for name in (*folders, "tumvi_room1_head/cam0/images"):
         path = sorted((data_dir / name).iterdir())[0]
         assert not is_mosaic(load_gray(path)[0]), name
+
+
+@pytest.mark.parametrize(("frames", "looked_at"), [(3, 3), (100, 8)])
+def test_levels_are_those_of_eight_frames_over_the_recording(
+    frames: int, looked_at: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Decoding more of a long recording would take minutes before its first pose."""
+    seen = list[Path]()
+    monkeypatch.setattr(image_pairs, "levels_in", lambda paths: (seen.extend(paths), FULL_SCALE)[1])
+    monkeypatch.setattr(image_pairs, "_mosaic_notes", lambda pairs: ())
+    monkeypatch.setattr(image_pairs, "_turn_notes", lambda pairs: ())
+    pairs = [(tmp_path / f"left{k}.png", tmp_path / f"right{k}.png") for k in range(frames)]
+    image_pairs.gray_levels(pairs)
+    assert len(seen) == 2 * looked_at
+    assert seen[:2] == list(pairs[0])
+    assert seen[-2:] == list(pairs[-1])

@@ -81,7 +81,8 @@ def test_a_view_is_believed_less_the_worse_it_fits_beside_the_others_of_its_clon
 
 def test_rays_of_left_views_meet_before_any_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "vio.filters.multiview._POINTS", replaced("vio.filters.multiview._POINTS", parallax_steps=0)
+        "vio.filters.multiview._TRIANGULATION",
+        replaced("vio.filters.multiview._TRIANGULATION", parallax_steps=0),
     )
     p = _points(5)
     found, known = first_points(CAMERA, T_CAM0_WORLD, _left_only(_views(p)))

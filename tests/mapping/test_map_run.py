@@ -35,6 +35,7 @@ from vio.mapping.features import KeyframeFeatures
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import LoopRow, MapStore
 from vio.mapping.session import HANDOVER_FRAMES, MapSession
+from vio.offline import inertial_adjustment
 from vio.offline.map_adjustment import _sigmas_moved, adjust_map
 from vio.records import (
     Estimate,
@@ -751,7 +752,8 @@ def test_a_map_that_is_not_adjusted_stays_as_it_is(
     if what == "keyframes":
         monkeypatch.setattr("vio.offline.map_adjustment.MAX_KEYFRAMES", 3)
     if what == "no optimum":
-        monkeypatch.setattr("vio.offline.inertial_adjustment._STEPS", 3)
+        few = replace(inertial_adjustment._ADJUSTMENT, max_steps=3)
+        monkeypatch.setattr(inertial_adjustment, "_ADJUSTMENT", few)
     result = replace(
         result, mapped=mapped, observations=None if what == "unobserved" else result.observations
     )

@@ -16,10 +16,10 @@ from vio.geometry.stereo import StereoCamera
 class _IntrinsicRules:
     """When intrinsics are observable, and when they are called wrong."""
 
-    # Standard deviations of what is left of a lens beyond its model, beside those of the estimate: on
-    # four real drives with calibrations of their own, focal lengths came out by -0.4 to +3.3 % and
-    # principal points by 1 to 4 % of a focal length from the given ones, with 0.3 to 0.7 % of standard
-    # deviation.
+    # Standard deviations of what is left of a lens beyond its model, beside those of the estimate:
+    # on four real drives with calibrations of their own, focal lengths came out by -0.4 to +3.3 %
+    # and principal points by 1 to 4 % of a focal length from the given ones, with 0.3 to 0.7 % of
+    # standard deviation.
     lens_focal: float = 0.012
     lens_centre: float = 0.02  # focal lengths
     largest_focal: float = 0.03  # standard deviations above which nothing can be said
@@ -27,7 +27,7 @@ class _IntrinsicRules:
     named_sigmas: float = 3.0
 
 
-_RULES = _IntrinsicRules()
+_JUDGED = _IntrinsicRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +61,9 @@ def judged_observable(
         centre_off: of the principal point, focal lengths.
         centre_sigma: its standard deviations.
     """
-    sigma = float(np.hypot(focal_sigma, _RULES.lens_focal))
-    across = [float(np.hypot(s, _RULES.lens_centre)) for s in centre_sigma]
-    if sigma > _RULES.largest_focal or max(across) > _RULES.largest_centre:
+    sigma = float(np.hypot(focal_sigma, _JUDGED.lens_focal))
+    across = [float(np.hypot(s, _JUDGED.lens_centre)) for s in centre_sigma]
+    if sigma > _JUDGED.largest_focal or max(across) > _JUDGED.largest_centre:
         return NotObservable(
             "focal length and principal point",
             f"the cameras turn too little: the standard deviations are {100 * sigma:.1f} % and "
@@ -80,7 +80,7 @@ def judge_intrinsics(found: Intrinsics | NotObservable) -> tuple[Finding, ...]:
     if isinstance(found, NotObservable):
         return ()
     out: dict[Fault, str] = {}
-    if abs(found.focal_off) > _RULES.named_sigmas * found.focal_sigma:
+    if abs(found.focal_off) > _JUDGED.named_sigmas * found.focal_sigma:
         out["focal length wrong"] = (
             f"off by {100 * found.focal_off:+.1f} % (standard deviation "
             f"{100 * found.focal_sigma:.1f} %): "
@@ -89,7 +89,7 @@ def judge_intrinsics(found: Intrinsics | NotObservable) -> tuple[Finding, ...]:
             "again, and check that the images were not resized"
         )
     if any(
-        abs(o) > _RULES.named_sigmas * s
+        abs(o) > _JUDGED.named_sigmas * s
         for o, s in zip(found.centre_off_px, found.centre_sigma_px, strict=True)
     ):
         (u, v) = found.centre_off_px

@@ -24,14 +24,14 @@ class _SeverityRules:
     # along rows fails.
     negligible_rows_px: float = 0.15
     unusable_rows_px: float = 2.0
-    # Lengths, per cent. Less than the first is below the drift of images alone on a road; a tenth is
-    # no measurement.
+    # Lengths, per cent. Less than the first is below the drift of images alone on a road; a
+    # tenth is no measurement.
     negligible_length: float = 0.2
     unusable_length: float = 10.0
     sigmas: float = 3.0  # standard deviations of doubt
 
 
-_RULES = _SeverityRules()
+_SEVERITY = _SeverityRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class StereoError:
             return "unusable"
         certain = 0.0
         if self.disparity_px is not None and self.seen_px > 0:
-            doubt = _RULES.sigmas * (self.disparity_sigma_px or 0.0)
+            doubt = _SEVERITY.sigmas * (self.disparity_sigma_px or 0.0)
             certain = 100 * max(abs(self.disparity_px) - doubt, 0.0) / self.seen_px
         return max(rows_grade(self.rows_px), length_grade(certain), key=get_args(Grade).index)
 
@@ -81,12 +81,12 @@ class StereoError:
 
 def rows_grade(rows_px: float) -> Grade:
     """Grade rows that are off (root mean square, pixels)."""
-    return _graded(rows_px, _RULES.negligible_rows_px, _RULES.unusable_rows_px)
+    return _graded(rows_px, _SEVERITY.negligible_rows_px, _SEVERITY.unusable_rows_px)
 
 
 def length_grade(percent: float) -> Grade:
     """Grade the share by which lengths come out wrong, %."""
-    return _graded(percent, _RULES.negligible_length, _RULES.unusable_length)
+    return _graded(percent, _SEVERITY.negligible_length, _SEVERITY.unusable_length)
 
 
 def _graded(size: float, negligible: float, unusable: float) -> Grade:

@@ -26,7 +26,7 @@ from vio.datasets.images import (
     load_gray,
     prefetch,
 )
-from vio.datasets.levels import FULL_SCALE, Levels, is_mosaic, mosaic_note
+from vio.datasets.levels import FULL_SCALE, LEVEL_IMAGES, Levels, is_mosaic, mosaic_note
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
@@ -129,16 +129,12 @@ def _say_skipped(unsaid: list[BadFrame]) -> None:
     unsaid.clear()
 
 
-# that determine the levels of black and white, spread over the recording: the first may be dark
-_LEVEL_FRAMES = 8
-
-
 def gray_levels(pairs: ImagePairs) -> tuple[Levels, tuple[str, ...]]:
     """Return the levels of black and white of a recording's images, for `load_gray`, with notes
     where they are not 0 and 65535, and where the images look like raw ones of a colour camera.
     """
     last = len(pairs) - 1
-    chosen = {last * k // (_LEVEL_FRAMES - 1) for k in range(_LEVEL_FRAMES)} if pairs else set()
+    chosen = {last * k // (LEVEL_IMAGES - 1) for k in range(LEVEL_IMAGES)} if pairs else set()
     levels = levels_in([path for k in sorted(chosen) for path in pairs[k]])
     return levels, (*levels.note, *_mosaic_notes(pairs), *_turn_notes(pairs))
 

@@ -29,6 +29,8 @@ class _LevelRules(NamedTuple):
 
 
 _LEVELS = _LevelRules()
+# of a camera that determine black and white, spread over the recording: the first may be dark
+LEVEL_IMAGES = 8
 
 
 @dataclass(frozen=True, slots=True)

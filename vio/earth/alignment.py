@@ -28,7 +28,7 @@ from vio.geometry.lie import (
     se3_log,
     so3_hat,
 )
-from vio.numerics.robust import truncated_weights
+from vio.numerics.robust import CUT_OFF_PROBABILITY, MU_GROWTH, truncated_weights
 from vio.numerics.sparse import factors
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
@@ -46,8 +46,6 @@ class _AlignmentRules:
     correlated_s: float = 5.0  # errors of GNSS last: positions within it count as one
     # of the antenna beside the stated error: 10 ms of the clocks at 10 m/s, the lever arm
     timing_m: float = 0.1
-    truncation: float = 0.999  # probability at which a residual is cut off
-    mu_growth: float = 1.6
     max_steps: int = 40
     settled: float = 1e-5
     start_steps: int = 20  # of the robust alignment that it starts from
@@ -251,7 +249,7 @@ class _Problem:
         log_scale = 0.0
         weight = known
         limits = np.array(
-            [chi_square_quantile(_ALIGNMENT.truncation, n) for n in (2, 1)], dtype=np.float64
+            [chi_square_quantile(CUT_OFF_PROBABILITY, n) for n in (2, 1)], dtype=np.float64
         )
         mu = None
         for _ in range(_ALIGNMENT.max_steps):
@@ -269,7 +267,7 @@ class _Problem:
                 and (mu > 1).all()
             ):
                 break
-            mu = mu * _ALIGNMENT.mu_growth
+            mu = mu * MU_GROWTH
         weight = (self._squared(T) < limits) * known
         for _ in range(_ALIGNMENT.max_steps):
             T, log_scale, moved = self._step(T, log_scale, weight)

@@ -42,7 +42,7 @@ class _AlignmentRules:
     stationary: float = 1e-12
 
 
-_RULES = _AlignmentRules()
+_ALIGNMENT = _AlignmentRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
     sign = np.array([1.0, 1.0, 1.0 if np.linalg.det(U @ Vt) > 0 else -1.0])
     R = (U * sign) @ Vt
     rotation_from: RotationSource = "positions"
-    moving = min(x_extent, y_extent) > 0 and d[0] > _RULES.collinear * x_extent * y_extent
+    moving = min(x_extent, y_extent) > 0 and d[0] > _ALIGNMENT.collinear * x_extent * y_extent
     if not moving:
         if mode == "sim3":
             raise EvaluationError(
@@ -93,7 +93,7 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
             )
         R = nearest_rotation(_orientation_sum(T_est, T_ref))
         rotation_from = "orientations"
-    elif d[1] <= _RULES.collinear * d[0]:
+    elif d[1] <= _ALIGNMENT.collinear * d[0]:
         R = _rotate_about(U[:, 0], R, _orientation_sum(T_est, T_ref))
         rotation_from = "direction and orientations"
     scale = float(d @ sign) / x_extent**2 if mode == "sim3" else 1.0
@@ -115,8 +115,10 @@ def settle_rotation(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) 
     R = _rotate_about(axis, alignment.R, _orientation_sum(T_est, T_ref))
     scatter = so3_log(R @ T_est[:, :3, :3] @ np.swapaxes(T_ref[:, :3, :3], 1, 2)) @ axis
     angle = np.linalg.norm(so3_log(R @ alignment.R.T))
-    precise = sigma > max(_RULES.loose_rad, _RULES.orientation_gain * np.sqrt(np.mean(scatter**2)))
-    if not precise or angle > _RULES.contradiction * sigma:
+    precise = sigma > max(
+        _ALIGNMENT.loose_rad, _ALIGNMENT.orientation_gain * np.sqrt(np.mean(scatter**2))
+    )
+    if not precise or angle > _ALIGNMENT.contradiction * sigma:
         return alignment
     t = T_ref[:, :3, 3].mean(axis=0) - alignment.scale * (R @ T_est[:, :3, 3].mean(axis=0))
     return Alignment(R, t, alignment.scale, "direction and orientations")
@@ -151,7 +153,7 @@ def _extent(p: FloatArray) -> float:
     coordinates.
     """
     extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
-    return extent if extent > _RULES.stationary * float(np.abs(p).max()) else 0.0
+    return extent if extent > _ALIGNMENT.stationary * float(np.abs(p).max()) else 0.0
 
 
 def _orientation_sum(T_est: FloatArray, T_ref: FloatArray) -> FloatArray:

@@ -35,7 +35,7 @@ class _AxisRules:
     axes_deg: float = 5.0
 
 
-_RULES = _AxisRules()
+_AXES = _AxisRules()
 # by which another order of the numbers must explain it better than other axes of the body do
 _BETTER = 3.0
 _NO_MEASURE = ", so attitude, RPE and drift, which use them, say nothing of the error"
@@ -63,7 +63,7 @@ def attitude_note(
     R_align = np.eye(3) if R_ref_est is None else R_ref_est
     R_raw = R_align.T @ R_est
     off_deg = median(rotation_angle_deg(np.swapaxes(R_ref, 1, 2) @ R_est))
-    if off_deg < max(_LARGE_DEG, _RULES.sigmas * float(np.degrees(sigma_rad))):
+    if off_deg < max(_LARGE_DEG, _AXES.sigmas * float(np.degrees(sigma_rad))):
         return None
     head = f"the attitudes differ by {off_deg:.0f} deg (median)"
     if _varies_deg(R_ref) < 1.0 and _varies_deg(R_est) > _LARGE_DEG:
@@ -87,10 +87,10 @@ def attitude_note(
     left = {key: _spread_deg(differences) for key, differences in others.items()}
     best = min(left.values())
     of_body = _spread_deg(body)
-    if min(of_body, best) > _RULES.constant * off_deg:
+    if min(of_body, best) > _AXES.constant * off_deg:
         return f"{head}, and no exchange of axes explains it; check what the reference's orientations mean"
     if _BETTER * best < of_body:
-        alike = [key for key in left if left[key] <= best + _RULES.alike_deg]
+        alike = [key for key in left if left[key] <= best + _AXES.alike_deg]
         causes = ", or ".join(f"the {whose}'s orientations are {words}" for whose, words in alike)
         return f"{head}: {causes}{_NO_MEASURE}; correct the file it was written from"
     return (
@@ -128,7 +128,7 @@ def _name(R: FloatArray) -> str:
     axes = np.rint(R)
     if (
         np.array_equal(np.abs(axes).sum(axis=0), np.ones(3))
-        and float(rotation_angle_deg(axes.T @ R)) < _RULES.axes_deg
+        and float(rotation_angle_deg(axes.T @ R)) < _AXES.axes_deg
     ):
         signed = (
             ("-" if row.sum() < 0 else "+") + "xyz"[int(np.argmax(np.abs(row)))] for row in axes

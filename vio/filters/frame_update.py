@@ -91,15 +91,15 @@ class _UpdateRules:
     scale_sigma: float = 0.001
     # by all views; a point of the map is reported with its covariance, and not used
     map_depth_sigma: float = 0.2
-    # A fit does not begin at a predicted pose where fewer of the tracks have a usable point, or that
-    # is off by more pixels.
-    in_view: float = 0.5
-    lost: float = 15.0
+    # A fit does not begin at a predicted pose where fewer of the tracks have a usable point, or
+    # that is off by more pixels.
+    min_usable_share: float = 0.5
+    max_start_px: float = 15.0
     # pixels by which the predicted pose may be off before one step over the window is too few
-    far: float = 0.5
-    nearer: float = 1.25  # by which factor a step must have come nearer for another one
+    one_step_px: float = 0.5
+    min_progress: float = 1.25  # by which factor a step must have come nearer for another one
     # innovations over their standard deviation (median): more, and the gyro may have jumped
-    contradicted: float = 2.0
+    jump_sigmas: float = 2.0
     # over the window in a frame: one is the rule, two bring in a start in motion, a third is an
     # exception
     max_steps: int = 4
@@ -277,7 +277,7 @@ class FrameUpdate:
         """Return the rotation (3,) by which the images contradict a gyro that is off, as noise (2,)
         that its prediction lacks shows, or the innovations; None: they do not, or there is none.
         """
-        contradicted = (predicted.innovation_ratio or 0.0) > _UPDATE.contradicted
+        contradicted = (predicted.innovation_ratio or 0.0) > _UPDATE.jump_sigmas
         off = bool(missing[1]) or contradicted
         settled = self._gyro_jump.is_settled(off=off)
         if not off or not self._has_imu or not settled:
@@ -331,16 +331,20 @@ class FrameUpdate:
         were given, fewer than half could be linearised, or they or the landmarks are far off.
         """
         innovation = tracks.newest_innovation()
-        lost = len(tracks.rows) < _UPDATE.in_view * given
-        if lost or (innovation is not None and innovation > _UPDATE.lost):
+        lost = len(tracks.rows) < _UPDATE.min_usable_share * given
+        if lost or (innovation is not None and innovation > _UPDATE.max_start_px):
             return True
         if len(pixels.z) <= given or len(window.clones) < 2:
             return False
         T = window.T_cam0_world(-1)[0]
         share = explained_share(
-            self._rig.camera, T, window.landmarks, self._corrected(window, pixels).z, _UPDATE.lost
+            self._rig.camera,
+            T,
+            window.landmarks,
+            self._corrected(window, pixels).z,
+            _UPDATE.max_start_px,
         )
-        return share < _UPDATE.in_view
+        return share < _UPDATE.min_usable_share
 
     def _corrected(self, window: Window, pixels: Views) -> Views:
         """Return the landmarks' pixels without the rectification error."""
@@ -403,7 +407,7 @@ class FrameUpdate:
             if (
                 innovation is None
                 or residual is None
-                or innovation < max(_UPDATE.far, _UPDATE.nearer * residual)
+                or innovation < max(_UPDATE.one_step_px, _UPDATE.min_progress * residual)
             ):
                 break
             innovation = residual

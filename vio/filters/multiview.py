@@ -34,27 +34,27 @@ MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
 CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
 
 
-class _PointRules(NamedTuple):
-    """What is known of a track's point before its views."""
+class _TriangulationRules(NamedTuple):
+    """How points are triangulated, and how much a view and a point count."""
 
     # of chi-square with 3 degrees of freedom, those of a stereo view
     chi_square_median: float = 2.37
-    # per px^2, information on the disparity: its standard deviation is 1000 px, half of what MIN_DEPTH
-    # shows
+    # per px^2, information on the disparity: its standard deviation is 1000 px, half of what
+    # MIN_DEPTH shows
     disparity_information: float = 1e-6
     # px^2, of the disparity of one stereo view, for one pixel of noise
     stereo_variance_px2: float = 2.0
-    # One camera, whose unit of length is arbitrary: standard deviation of an inverse depth over itself,
-    # for one pixel of noise, at most. With a limit in the unit, slow flights have no track; with one
-    # for the learned noise, standstills have too many (docs/notes/design_decisions.md, depth of one
-    # camera's tracks).
+    # One camera, whose unit of length is arbitrary: standard deviation of an inverse depth over
+    # itself, for one pixel of noise, at most. With a limit in the unit, slow flights have no track;
+    # with one for the learned noise, standstills have too many (docs/notes/design_decisions.md,
+    # depth of one camera's tracks).
     mono_depth_sigma: float = 0.15
     tiny: float = 1e-12  # keeps what nothing was seen of invertible
     # Gauss-Newton steps on a new point without a stereo view, before any pose has moved
     parallax_steps: int = 3
 
 
-_POINTS = _PointRules()
+_TRIANGULATION = _TriangulationRules()
 # of a point at infinity: ten baselines of motion move it by a hundredth of a pixel
 MIN_DISPARITY_PX = 1e-3
 
@@ -131,10 +131,16 @@ def first_points(
         left = Views(views.z[left_only], earlier[left_only])
         start: FloatArray = np.empty((len(left.z), 3))
         loops.start_by_parallax(
-            camera_args(camera), disparities, _POINTS.tiny, T_cam0_world, left.z, left.weight, start
+            camera_args(camera),
+            disparities,
+            _TRIANGULATION.tiny,
+            T_cam0_world,
+            left.z,
+            left.weight,
+            start,
         )
         p[left_only] = refine_points(
-            camera, T_cam0_world, start, left, _POINTS.parallax_steps, CAUCHY
+            camera, T_cam0_world, start, left, _TRIANGULATION.parallax_steps, CAUCHY
         )
     return p, known | left_only
 
@@ -154,7 +160,9 @@ def refine_points(
     that saw the point.
     """
     p = p_world.copy()
-    damping = Damping(scale_px**2, _POINTS.tiny, _POINTS.disparity_information, MIN_DISPARITY_PX)
+    damping = Damping(
+        scale_px**2, _TRIANGULATION.tiny, _TRIANGULATION.disparity_information, MIN_DISPARITY_PX
+    )
     room = InverseDepth.empty(len(p))
     loops.refine(
         _cameras(camera, T_cam0_world), views, steps, damping, _room(views.weight), room, p
@@ -171,7 +179,7 @@ def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
         sigma2: the pixel noise's variance, the smallest scale.
     """
     weights = np.empty(at.r.shape[:2])
-    loops.weigh_views(at.r, at.z_D_p, sigma2, _POINTS.chi_square_median, CAUCHY, weights)
+    loops.weigh_views(at.r, at.z_D_p, sigma2, _TRIANGULATION.chi_square_median, CAUCHY, weights)
     return weights
 
 
@@ -277,7 +285,12 @@ def track_information(
         InverseDepth.empty(F), of_clones, C, B, np.empty((F, 6 * N)), np.empty((F, 3))
     )
     loops.collect_tracks(
-        _cameras(camera, T_cam0_world), at, weight, p_world, _POINTS.disparity_information, info
+        _cameras(camera, T_cam0_world),
+        at,
+        weight,
+        p_world,
+        _TRIANGULATION.disparity_information,
+        info,
     )
     return info
 
@@ -289,7 +302,7 @@ def relative_stereo_sigma(at: Residuals, q: InverseDepth, chosen: IntArray) -> F
     It is that for one pixel of noise; infinite without a right view.
     """
     out: FloatArray = np.empty(len(chosen))
-    loops.stereo_sigmas(chosen, at.z_D_p, q.disparity, _POINTS.stereo_variance_px2, out)
+    loops.stereo_sigmas(chosen, at.z_D_p, q.disparity, _TRIANGULATION.stereo_variance_px2, out)
     return out
 
 
@@ -306,11 +319,11 @@ def usable_points(
     """
     keep: BoolArray = np.empty(len(p_world), dtype=np.bool_)
     variances = (
-        (0.0, _POINTS.mono_depth_sigma**2)
+        (0.0, _TRIANGULATION.mono_depth_sigma**2)
         if camera.kind == "mono"
-        else (_POINTS.stereo_variance_px2, 0.0)
+        else (_TRIANGULATION.stereo_variance_px2, 0.0)
     )
-    limits = DepthLimits(*variances, _POINTS.tiny, _POINTS.disparity_information)
+    limits = DepthLimits(*variances, _TRIANGULATION.tiny, _TRIANGULATION.disparity_information)
     room = InverseDepth.empty(1)
     seen = at._replace(weight=views.weight)
     loops.mark_usable(_cameras(camera, T_cam0_world), p_world, seen, limits, room, keep)

@@ -278,11 +278,16 @@ class CalibrationBlock:
         return None
 
     def camera_D_error(
-        self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None
+        self,
+        calibration: Calibration,
+        T_world_imu: FloatArray,
+        T_exposed: FloatArray,
+        twist: Twist | None,
     ) -> FloatArray | None:
         """How its errors move the camera at an exposure (6, n), equation (C2); None: not.
 
         Args:
+            calibration: the present one.
             T_world_imu: the navigation state's pose (4, 4).
             T_exposed: the body's at the exposure (4, 4).
             twist: of the body; None while exposures do not follow the time offset's error.
@@ -422,7 +427,11 @@ class _ExtrinsicsBlock(CalibrationBlock):
         return se3_adjoint(T)
 
     def camera_D_error(
-        self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None
+        self,
+        calibration: Calibration,
+        T_world_imu: FloatArray,
+        T_exposed: FloatArray,
+        twist: Twist | None,
     ) -> FloatArray | None:
         return -se3_adjoint(T_exposed @ se3_inverse(T_world_imu))
 
@@ -458,7 +467,11 @@ class _TimeOffsetBlock(CalibrationBlock):
         return {"time_offset_s": calibration.time_offset_s, "time_offset_sigma_s": sigma}
 
     def camera_D_error(
-        self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None
+        self,
+        calibration: Calibration,
+        T_world_imu: FloatArray,
+        T_exposed: FloatArray,
+        twist: Twist | None,
     ) -> FloatArray | None:
         return None if twist is None else (se3_adjoint(T_exposed) @ twist.significant())[:, None]
 

@@ -320,7 +320,8 @@ class Window:
         if "time_offset" in state:
             exposed = T @ se3_exp(twist.mean * (calibration.time_offset_s - late_s))
         for name in calibration.estimated:
-            column = BLOCKS[name].camera_D_error(T, exposed, twist if compared else None)
+            seen = twist if compared else None
+            column = BLOCKS[name].camera_D_error(calibration, T, exposed, seen)
             if column is not None:
                 J[:, state[name]] = column
         return exposed, J

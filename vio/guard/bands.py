@@ -26,20 +26,20 @@ from vio.records import Image
 class _BandRules:
     """When bands are taken out, and from what they are measured."""
 
-    # Change of the difference of row means in a frame, gray levels (root mean square over the rows).
-    # Measured: up to 7 on recordings without a fault, up to 19 where the right camera is late, 70 and
-    # more by bands of 25 %.
-    change: float = 25.0
+    # Change of the difference of row means in a frame, gray levels (root mean square over the
+    # rows). Measured: up to 7 on recordings without a fault, up to 19 where the right camera is
+    # late, 70 and more by bands of 25 %.
+    min_change: float = 25.0
     frames: int = 3  # such frames among the last ones before bands are taken out
     memory: int = 10  # frames
     # of an image over the other's: a camera that goes dark now and then has no bands
     min_contrast: float = 0.3
-    stride: int = 8  # of the pixels that the contrast is computed from
+    stride_px: int = 8  # of the pixels that the contrast is computed from
     # standard deviation: bands are wider, and horizontal edges of the scene are narrower
-    smooth_rows: float = 3.0
+    smooth_sigma_rows: float = 3.0
 
 
-_RULES = _BandRules()
+_BANDS = _BandRules()
 
 
 class BandRemoval(ImageCheck):
@@ -60,8 +60,8 @@ class BandRemoval(ImageCheck):
         """Return both images (H, W) of a frame, without bands where there are such."""
         rows_left = _row_means(left)
         rows_right = _row_means(right)
-        contrast = sorted(mean_and_contrast(image, _RULES.stride)[1] for image in (left, right))
-        if not self._active and contrast[0] > _RULES.min_contrast * contrast[1]:
+        contrast = sorted(mean_and_contrast(image, _BANDS.stride_px)[1] for image in (left, right))
+        if not self._active and contrast[0] > _BANDS.min_contrast * contrast[1]:
             self._detect(index, _smoothed(_without_gain(rows_left, rows_right)))
         if not self._active:
             return left, right
@@ -71,11 +71,11 @@ class BandRemoval(ImageCheck):
         centred = difference - _mean(difference)
         if self._last is not None and self._last.shape == centred.shape:
             change = math.sqrt(_mean((centred - self._last) ** 2))
-            self._changed = [k for k in self._changed if index - k < _RULES.memory] + [index] * (
-                change > _RULES.change
+            self._changed = [k for k in self._changed if index - k < _BANDS.memory] + [index] * (
+                change > _BANDS.min_change
             )
         self._last = centred
-        if len(self._changed) >= _RULES.frames:
+        if len(self._changed) >= _BANDS.frames:
             self._active = True
             message = (
                 f"frame {index}: bands of brightness move through the images, differently in both "
@@ -110,7 +110,8 @@ def _smoothed(rows: FloatArray) -> FloatArray:
     """Values (H,) of rows, smoothed over a few of them."""
     line = rows[None]  # filtered in a tenth of the time that a column takes
     return np.asarray(
-        cv2.GaussianBlur(line, (0, 1), sigmaX=_RULES.smooth_rows, sigmaY=1.0), dtype=np.float64
+        cv2.GaussianBlur(line, (0, 1), sigmaX=_BANDS.smooth_sigma_rows, sigmaY=1.0),
+        dtype=np.float64,
     )[0]
 
 

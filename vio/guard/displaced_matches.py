@@ -28,15 +28,15 @@ class _RowRules:
     min_frames: int = 5  # that the field was learned from
     memory: float = 0.97  # per frame, of the normal equations
     row_sigma_px: float = 0.5  # of the rows, beyond which a match counts less (Cauchy)
-    # median distance from the field that contradicts it: that of rows that are random within 1.5 px, in
-    # which descriptors are matched …
+    # median distance from the field that contradicts it: that of rows that are random within 1.5
+    # px, in which descriptors are matched …
     min_rows_px: float = 0.75
-    clearly: float = 5.0  # … and times the usual one
-    agrees: float = 0.5  # of the distance that contradicts, below which the rows fit again
+    clear_ratio: float = 5.0  # … and times the usual one
+    agreeing_ratio: float = 0.5  # of the distance that contradicts, below which the rows fit again
     usual_gain: float = 0.2  # how fast the usual distance is learned
 
 
-_RULES = _RowRules()
+_ROWS = _RowRules()
 _TERMS = 6
 _CODE = "right-contradicts-left"
 
@@ -59,13 +59,13 @@ class DisplacedMatches(MatchCheck):
         index = seen.frame_index
         state = self._state
         z = seen.z[seen.has_right]
-        if len(z) < _RULES.min_matches:
+        if len(z) < _ROWS.min_matches:
             state.show(index, None)
             return seen if state.since is None else without_right(seen)
         terms = self._terms(z)
         rows = z[:, 3] - z[:, 1]
         off_px = float(np.median(np.abs(rows - terms @ self._field)))
-        limit_px = max(_RULES.min_rows_px, _RULES.clearly * self._usual_px)
+        limit_px = max(_ROWS.min_rows_px, _ROWS.clear_ratio * self._usual_px)
         sign = self._sign(off_px, limit_px)
         state.show(index, sign)
         if not sign and state.since is None:
@@ -86,11 +86,11 @@ class DisplacedMatches(MatchCheck):
         return seen if state.since is None else without_right(seen)
 
     def _sign(self, off_px: float, limit_px: float) -> bool | None:
-        if self._frames < _RULES.min_frames:
+        if self._frames < _ROWS.min_frames:
             return None
         if off_px > limit_px:
             return True
-        return False if off_px <= _RULES.agrees * limit_px else None
+        return False if off_px <= _ROWS.agreeing_ratio * limit_px else None
 
     def _terms(self, z: FloatArray) -> FloatArray:
         """The terms (N, 6) of the field at left pixels of `z` (N, 4)."""
@@ -99,12 +99,12 @@ class DisplacedMatches(MatchCheck):
         return np.array([np.ones(len(x)), x, y, x * y, x * x, y * y]).T.copy()
 
     def _learn(self, terms: FloatArray, rows: FloatArray, off_px: float) -> None:
-        self._normal *= _RULES.memory
-        self._moment *= _RULES.memory
-        sigma = _RULES.row_sigma_px if self._frames else np.inf
+        self._normal *= _ROWS.memory
+        self._moment *= _ROWS.memory
+        sigma = _ROWS.row_sigma_px if self._frames else np.inf
         add_equations(terms, rows, self._field, sigma, self._normal, self._moment)
         self._field = self._moment.copy()
         solve_positive(self._normal + 1e-6 * np.eye(_TERMS), self._field)
         if self._frames:
-            self._usual_px += _RULES.usual_gain * (off_px - self._usual_px)
+            self._usual_px += _ROWS.usual_gain * (off_px - self._usual_px)
         self._frames += 1

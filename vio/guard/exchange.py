@@ -32,15 +32,17 @@ class _ExchangeRules:
     # width and height, so coarse that a shift of the image by some pixels changes little
     thumbnail: tuple[int, int] = (48, 30)
     # averaged first: OpenCV averages whole pixels five times as fast as fractions of them
-    block: int = 4
+    block_px: int = 4
     min_points: int = 20
-    many: float = 0.4  # share of points with a negative disparity that proves an exchange
-    # share of them above which a frame that looks exchanged is refused: its rows do not fit when put
-    # back
-    some: float = 0.2
+    exchanged_share: float = (
+        0.4  # share of points with a negative disparity that proves an exchange
+    )
+    # share of them above which a frame that looks exchanged is refused: its rows do not fit when
+    # put back
+    refused_share: float = 0.2
 
 
-_RULES = _ExchangeRules()
+_EXCHANGE = _ExchangeRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +93,7 @@ class ExchangeDetector(ImageCheck):
         left, right = images.halves
         points = self._probe.corners(left)
         negative = self._probe.negative(left, right, points)
-        if not exchanged and negative < _RULES.some * len(points):
+        if not exchanged and negative < _EXCHANGE.refused_share * len(points):
             return MatchCounts(len(points), 0, negative)
         return MatchCounts(len(points), self._probe.positive(left, right, points), negative)
 
@@ -154,14 +156,14 @@ class ExchangeDetector(ImageCheck):
 
 def _thumbnail(image: Image) -> Image:
     """A small copy of an image, averaged over areas."""
-    width, height = (size // _RULES.block for size in image.shape[::-1])
-    if width >= _RULES.thumbnail[0] and height >= _RULES.thumbnail[1]:
-        whole = image[: _RULES.block * height, : _RULES.block * width]
+    width, height = (size // _EXCHANGE.block_px for size in image.shape[::-1])
+    if width >= _EXCHANGE.thumbnail[0] and height >= _EXCHANGE.thumbnail[1]:
+        whole = image[: _EXCHANGE.block_px * height, : _EXCHANGE.block_px * width]
         image = np.asarray(
             cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
         )
     return np.asarray(
-        cv2.resize(image, _RULES.thumbnail, interpolation=cv2.INTER_AREA), dtype=np.uint8
+        cv2.resize(image, _EXCHANGE.thumbnail, interpolation=cv2.INTER_AREA), dtype=np.uint8
     )
 
 
@@ -170,10 +172,10 @@ def _judge(found: MatchCounts, likely: Order) -> Order:
     is as before.
     """
     if (
-        found.points < _RULES.min_points
-        or max(found.negative, found.positive) < _RULES.some * found.points
+        found.points < _EXCHANGE.min_points
+        or max(found.negative, found.positive) < _EXCHANGE.refused_share * found.points
     ):
         return likely
     if found.negative < 2 * found.positive:
         return "given"
-    return "exchanged" if found.negative >= _RULES.many * found.points else "refused"
+    return "exchanged" if found.negative >= _EXCHANGE.exchanged_share * found.points else "refused"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from vio.errors import DataError
 from vio.findings import Finder, Finding
 from vio.guard.match_check import Hysteresis
+from vio.guard.probe import MIN_SIGNED_PX
 from vio.records import Observations
 
 
@@ -15,13 +16,12 @@ class _ExchangeRules:
     """When left and right pixels count as exchanged."""
 
     min_matches: int = 20  # with fewer, a frame tells nothing
-    # of a disparity that counts as negative: far points have about none
-    min_negative_px: float = 1.0
-    many: float = 0.6  # share of negative disparities that proves an exchange; usual is below 0.02
+    # share of negative disparities that proves an exchange; usual is below 0.02
+    exchanged_share: float = 0.6
     frames: int = 3  # the first ones that say so make the recording a wrong one
 
 
-_RULES = _ExchangeRules()
+_EXCHANGE = _ExchangeRules()
 _CODE = "images-exchanged"
 
 
@@ -42,21 +42,21 @@ class ExchangedMatches(Finder):
             DataError: the first frames are exchanged.
         """
         matched = seen.z[seen.has_right]
-        if len(matched) < _RULES.min_matches:
+        if len(matched) < _EXCHANGE.min_matches:
             return self._put_back(seen)
-        negative = int((matched[:, 2] - matched[:, 0] >= _RULES.min_negative_px).sum())
+        negative = int((matched[:, 2] - matched[:, 0] >= MIN_SIGNED_PX).sum())
         self._judge(seen.frame_index, negative, len(matched))
         return self._put_back(seen)
 
     def _judge(self, index: int, negative: int, matches: int) -> None:
-        exchanged = negative >= _RULES.many * matches
+        exchanged = negative >= _EXCHANGE.exchanged_share * matches
         self._in_order |= not exchanged
         state = self._state
         state.show(index, exchanged)
-        if not self._in_order and state.frames >= _RULES.frames:
+        if not self._in_order and state.frames >= _EXCHANGE.frames:
             raise DataError(
                 f"frame {index}: left and right pixels look exchanged ({negative} of {matches} "
-                f"disparities are negative, in {_RULES.frames} frames); exchange the columns of the "
+                f"disparities are negative, in {_EXCHANGE.frames} frames); exchange the columns of the "
                 "features, or the cameras' calibration"
             )
         if self._in_order and state.to_report():

@@ -27,8 +27,8 @@ class _FrozenRules:
     stride: int = 4  # of the half-resolution images' pixels that are compared
     # change of a frozen camera's image over that of the other's, at most: sensor noise is left
     frozen_share: float = 0.3
-    # change of a frozen camera's image by noise of the sensor or an encoder, gray levels at the common
-    # contrast
+    # change of a frozen camera's image by noise of the sensor or an encoder, gray levels at the
+    # common contrast
     max_noise: float = 3.0
     # the same of the other camera's image: where it changes by less, nothing can be concluded
     min_change: float = 1.0
@@ -38,7 +38,7 @@ class _FrozenRules:
     dark_share: float = 0.1  # contrast of a dark or covered image over that of the other one
 
 
-_RULES = _FrozenRules()
+_FROZEN = _FrozenRules()
 
 _SEEN: dict[Cause, str] = {
     "right-image-frozen": "the right camera is frozen: its image does not change while the left "
@@ -90,8 +90,8 @@ class FrozenCamera(ImageCheck):
         """
         now = _SparseImages(
             index,
-            left[:: _RULES.stride, :: _RULES.stride].copy(),
-            right[:: _RULES.stride, :: _RULES.stride].copy(),
+            left[:: _FROZEN.stride, :: _FROZEN.stride].copy(),
+            right[:: _FROZEN.stride, :: _FROZEN.stride].copy(),
         )
         last = self._last
         if last is None:
@@ -103,7 +103,7 @@ class FrozenCamera(ImageCheck):
         self._end_left(index)
         if (
             mean_and_contrast(now.right, 1)[1]
-            < _RULES.dark_share * mean_and_contrast(now.left, 1)[1]
+            < _FROZEN.dark_share * mean_and_contrast(now.left, 1)[1]
         ):
             self._distrust("right-image-dark", last.index, index)
             return False
@@ -114,8 +114,8 @@ class FrozenCamera(ImageCheck):
             return False
         if self._cause is not None:
             self._end_right(index)
-        elif change_left > _RULES.min_change:
-            self._ratio += _RULES.ratio_gain * (change_right / change_left - self._ratio)
+        elif change_left > _FROZEN.min_change:
+            self._ratio += _FROZEN.ratio_gain * (change_right / change_left - self._ratio)
         self._last = now
         return False
 
@@ -126,7 +126,7 @@ class FrozenCamera(ImageCheck):
             self._count = 0
         self._cause = cause
         self._count += 1
-        if self._count == _RULES.frames:
+        if self._count == _FROZEN.frames:
             self._reported = cause
             message = (
                 f"frame {index}: {_SEEN[cause]}, since frame {self._since}; going on with the left "
@@ -136,7 +136,7 @@ class FrozenCamera(ImageCheck):
 
     def _end_right(self, index: int) -> None:
         assert self._cause is not None
-        if self._count >= _RULES.frames:
+        if self._count >= _FROZEN.frames:
             message = f"frame {index}: the right camera gives new images again"
             self._found.append(Finding(self._reported, message, index, ended=True))
         self._cause = None
@@ -144,7 +144,7 @@ class FrozenCamera(ImageCheck):
     def _count_left(self, since: int, index: int) -> None:
         """Count frames with a frozen left image, and report it once."""
         self._left_frozen += 1
-        if self._left_frozen == _RULES.frames:
+        if self._left_frozen == _FROZEN.frames:
             message = (
                 f"frame {index}: the left camera is frozen: its image does not change since frame "
                 f"{since} while the right one does; the right images alone follow what the last "
@@ -153,7 +153,7 @@ class FrozenCamera(ImageCheck):
             self._found.append(Finding("left-image-frozen", message, index, since + 1, lasts=True))
 
     def _end_left(self, index: int) -> None:
-        if self._left_frozen >= _RULES.frames:
+        if self._left_frozen >= _FROZEN.frames:
             message = f"frame {index}: the left camera gives new images again"
             self._found.append(Finding("left-image-frozen", message, index, ended=True))
         self._left_frozen = 0
@@ -165,6 +165,6 @@ def _is_frozen(change: float, other_change: float) -> bool:
     """
     if change == 0.0:
         return other_change > 0.0
-    return change < _RULES.max_noise and other_change > max(
-        _RULES.min_change, change / _RULES.frozen_share
+    return change < _FROZEN.max_noise and other_change > max(
+        _FROZEN.min_change, change / _FROZEN.frozen_share
     )

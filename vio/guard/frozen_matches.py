@@ -17,11 +17,11 @@ class _FrozenRules:
 
     min_matches: int = 8  # shared with the frame before, with fewer of which a frame tells nothing
     min_motion_px: float = 2.0  # of the left pixels in their median: where they move less, likewise
-    frozen: float = 0.1  # motion of right pixels over that of the left ones, at most
-    moves: float = 0.5  # share from which on the camera moves again; usual is 0.7 to 1.3
+    frozen_share: float = 0.1  # motion of right pixels over that of the left ones, at most
+    moving_share: float = 0.5  # share from which on the camera moves again; usual is 0.7 to 1.3
 
 
-_RULES = _FrozenRules()
+_FROZEN = _FrozenRules()
 _CODE = "right-image-frozen"
 
 
@@ -51,13 +51,13 @@ class FrozenMatches(MatchCheck):
 
 def _is_frozen(shared: SharedMatches) -> bool | None:
     """Whether the right pixels stay; None: the frame does not tell."""
-    if len(shared) < _RULES.min_matches:
+    if len(shared) < _FROZEN.min_matches:
         return None
     moved = np.abs(shared.now - shared.before)
     left = float(np.median(moved[:, :2].max(axis=1)))
     right = float(np.median(moved[:, 2:].max(axis=1)))
-    if left < _RULES.min_motion_px:
+    if left < _FROZEN.min_motion_px:
         return None
-    if right <= _RULES.frozen * left:
+    if right <= _FROZEN.frozen_share * left:
         return True
-    return False if right >= _RULES.moves * left else None
+    return False if right >= _FROZEN.moving_share * left else None

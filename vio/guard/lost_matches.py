@@ -15,13 +15,13 @@ class _LostRules:
 
     min_features: int = 20  # in a frame that tells
     # share of features with a right match, below which few of them are usual
-    min_usual: float = 0.3
+    min_usual_share: float = 0.3
     gain: float = 0.1  # how fast the usual share is learned
-    lost: float = 0.2  # of the usual share, below which matches are lost …
-    back: float = 0.5  # … and from which on they are back
+    lost_share: float = 0.2  # of the usual share, below which matches are lost …
+    back_share: float = 0.5  # … and from which on they are back
 
 
-_RULES = _LostRules()
+_LOST = _LostRules()
 _CODE = "right-matches-lost"
 
 
@@ -37,11 +37,11 @@ class LostMatches(MatchCheck):
         """Compare how many features have a right match with how many usually have one."""
         index = seen.frame_index
         state = self._state
-        share = float(seen.has_right.mean()) if len(seen) >= _RULES.min_features else None
+        share = float(seen.has_right.mean()) if len(seen) >= _LOST.min_features else None
         state.show(index, self._is_lost(share))
         if share is not None and state.since is None:
             usual = share if self._usual is None else self._usual
-            self._usual = usual + _RULES.gain * (share - usual)
+            self._usual = usual + _LOST.gain * (share - usual)
         if share is not None and state.to_report():
             message = (
                 f"frame {index}: hardly any feature has a right match since frame {state.since} "
@@ -58,8 +58,8 @@ class LostMatches(MatchCheck):
         return seen
 
     def _is_lost(self, share: float | None) -> bool | None:
-        if share is None or self._usual is None or self._usual < _RULES.min_usual:
+        if share is None or self._usual is None or self._usual < _LOST.min_usual_share:
             return None
-        if share < _RULES.lost * self._usual:
+        if share < _LOST.lost_share * self._usual:
             return True
-        return False if share >= _RULES.back * self._usual else None
+        return False if share >= _LOST.back_share * self._usual else None

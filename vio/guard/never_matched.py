@@ -17,12 +17,12 @@ class _NeverRules:
     min_features: int = 20  # in a frame that tells
     # share of features with a right match: one frame with more of them shows a pair. The least
     # median of healthy recordings is 0.29 (Karlsruhe, a hood in view).
-    most: float = 0.06
+    matched_share: float = 0.06
     frames: int = 5  # that tell, before it is reported
-    back: float = 0.3  # share from which on a reported loss has ended
+    back_share: float = 0.3  # share from which on a reported loss has ended
 
 
-_RULES = _NeverRules()
+_NEVER = _NeverRules()
 _CODE = "right-matches-missing"
 
 
@@ -41,22 +41,22 @@ class NeverMatched(Finder):
 
     def see(self, seen: Observations) -> None:
         """Take the features of a frame whose right image may be used."""
-        if self._over or len(seen) < _RULES.min_features:
+        if self._over or len(seen) < _NEVER.min_features:
             return
         index = seen.frame_index
         share = float(seen.has_right.mean())
         if self._reported:
-            if share >= _RULES.back:
+            if share >= _NEVER.back_share:
                 self._over = True
                 message = f"frame {index}: features have right matches"
                 self._found.append(Finding(_CODE, message, index, ended=True))
             return
-        if share > _RULES.most:
+        if share > _NEVER.matched_share:
             self._over = True
             return
         self._since = index if self._since is None else self._since
         self._frames += 1
-        if self._frames < _RULES.frames:
+        if self._frames < _NEVER.frames:
             return
         self._reported = True
         message = (

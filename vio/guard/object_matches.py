@@ -34,14 +34,14 @@ class _ObjectRules:
     """How features of any front end are compared with a motion."""
 
     limit_px: float = 1.5  # of a static point, at least …
-    scatter: float = 3.0  # … and over the usual median of all points' errors
+    limit_ratio: float = 3.0  # … and over the usual median of all points' errors
     usual_gain: float = 0.1  # how fast that is learned
     max_usual_px: float = 5.0  # beyond which it is not believed
     min_frames: int = 5  # that it was learned from
     seed: int = 0  # of the consensus
 
 
-_RULES = _ObjectRules()
+_OBJECTS = _ObjectRules()
 _NO_IDS: IntArray = np.zeros(0, dtype=np.int64)
 
 
@@ -123,14 +123,14 @@ class ObjectMatches(Finder):
         dropped = np.zeros(len(seen), dtype=np.bool_)
         deep = shared.has_depth
         points = MovedPoints(shared.point[deep], shared.left[deep], shared.age[deep])
-        limit_px = max(_RULES.limit_px, _RULES.scatter * self._usual_px)
-        rng = np.random.default_rng((_RULES.seed, seen.frame_index))
+        limit_px = max(_OBJECTS.limit_px, _OBJECTS.limit_ratio * self._usual_px)
+        rng = np.random.default_rng((_OBJECTS.seed, seen.frame_index))
         problem = RansacProblem(self._camera, limit_px, rng)
         seconds = (seen.time_ns - before.time_ns) * 1e-9
         found = self._consensus(problem, points, seen.ids[shared.rows[deep]], prior, seconds)
         if found is None:
             return dropped
-        if self._frames < _RULES.min_frames:
+        if self._frames < _OBJECTS.min_frames:
             self._twist_per_s = se3_log(found.T_curr_prev) / seconds
             self._learn(points, found)
             return dropped
@@ -172,9 +172,9 @@ class ObjectMatches(Finder):
     def _learn(self, points: MovedPoints, found: Consensus) -> None:
         """Learn how far features usually are from one motion."""
         errors = pixel_errors(self._camera, found.T_curr_prev, points.p_prev, points.pixels)
-        median_px = min(float(np.median(errors)), _RULES.max_usual_px)
+        median_px = min(float(np.median(errors)), _OBJECTS.max_usual_px)
         self._frames += 1
-        gain = max(_RULES.usual_gain, 1.0 / self._frames)
+        gain = max(_OBJECTS.usual_gain, 1.0 / self._frames)
         self._usual_px += gain * (median_px - self._usual_px)
 
     def _static(self, problem: RansacProblem, shared: _Shared, motion: Consensus) -> BoolArray:

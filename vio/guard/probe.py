@@ -10,7 +10,7 @@ import numpy as np
 
 from vio.frontend.detect import detect_corners
 from vio.frontend.settings import GridSettings
-from vio.frontend.stereo_match import match_rows, shifted_rows
+from vio.frontend.stereo_match import ROW_SEARCH, match_rows, shifted_rows
 from vio.geometry.lie import FloatArray
 from vio.records import Image, IntArray
 
@@ -21,19 +21,14 @@ CORNERS = 80  # that are searched, at most
 class _ProbeRules:
     """How corners are searched along rows, and when the rows are."""
 
-    max_disparity: float = 0.64  # of the image width: near scenes, too
     usual_disparity: float = 0.16  # enough to compare pairings
     min_correlation: float = 0.8
-    good_correlation: float = 0.9  # of patches whose rows agree
-    min_margin: float = 0.03  # lead over the second-best match of a row
-    # of a disparity that has a sign: next to zero, the search to the wrong side matches as well
-    min_signed_px: float = 1.0
-    max_rows_half: int = 16  # row difference that is searched, pixels at half resolution
-    clearly: int = 2  # times as many matches at another row difference
+    clear_ratio: int = 2  # times as many matches at another row difference
 
 
-_RULES = _ProbeRules()
-_FEW = 0.2  # share of the corners with a match below which other row differences are tried
+_PROBE = _ProbeRules()
+# of a disparity that has a sign: next to zero, the search to the wrong side matches as well
+MIN_SIGNED_PX = 1.0
 # row differences of a camera that is pitched a little, pixels at half resolution
 _NEAR_ROWS = np.arange(-3.0, 3.1, 0.5)
 
@@ -60,7 +55,7 @@ class RowProbe:
     def positive(self, left: Image, right: Image, points: FloatArray) -> int:
         """Count the pixels (N, 2) of the left image that match with a positive disparity."""
         found = self._positive(left, right, points)
-        if found < _FEW * len(points) and not self._searched:
+        if found < ROW_SEARCH.few_share * len(points) and not self._searched:
             self._search(left, right, points)
             found = self._positive(left, right, points)
         return found
@@ -98,43 +93,42 @@ class RowProbe:
         return np.array(counts[0] + counts[self._rows], dtype=np.int64)
 
     def _well_matched(self, left: Image, right: Image, points: FloatArray) -> int:
-        reach = _RULES.usual_disparity * 2 * left.shape[1]
+        reach = _PROBE.usual_disparity * 2 * left.shape[1]
         return int(
-            match_rows(left, right, points, reach, _RULES.good_correlation, _RULES.min_margin)[
-                1
-            ].sum()
+            match_rows(
+                left, right, points, reach, ROW_SEARCH.good_correlation, ROW_SEARCH.min_margin
+            )[1].sum()
+        )
+
+    def _count(
+        self, left: Image, right: Image, points: FloatArray, rows: int, correlation: float
+    ) -> int:
+        reach = ROW_SEARCH.max_disparity * 2 * left.shape[1]
+        other = shifted_rows(right, rows)
+        return int(
+            match_rows(left, other, points, reach, correlation, ROW_SEARCH.min_margin)[1].sum()
         )
 
     def _search(self, left: Image, right: Image, points: FloatArray) -> None:
         """Take the row difference at which most pixels match well, where it is a clear one."""
         self._searched = True
-        tried = range(-_RULES.max_rows_half, _RULES.max_rows_half + 1)
-        reach = _RULES.max_disparity * 2 * left.shape[1]
-        found = [
-            match_rows(
-                left,
-                shifted_rows(right, rows),
-                points,
-                reach,
-                _RULES.good_correlation,
-                _RULES.min_margin,
-            )[1]
-            for rows in tried
+        tried = range(-ROW_SEARCH.max_rows_half, ROW_SEARCH.max_rows_half + 1)
+        counts = [
+            self._count(left, right, points, rows, ROW_SEARCH.good_correlation) for rows in tried
         ]
-        counts = [int(good.sum()) for good in found]
         best = int(np.argmax(counts))
-        present = counts[self._rows + _RULES.max_rows_half]
-        if counts[best] >= max(_FEW * len(points), _RULES.clearly * present):
+        present = counts[self._rows + ROW_SEARCH.max_rows_half]
+        if counts[best] >= max(ROW_SEARCH.few_share * len(points), _PROBE.clear_ratio * present):
             self._rows = tried[best]
 
 
 def _signed(left: Image, right: Image, points: FloatArray) -> int:
     """Count the pixels (N, 2) of the left image that match clearly left of themselves."""
-    reach = _RULES.max_disparity * 2 * left.shape[1]
+    reach = ROW_SEARCH.max_disparity * 2 * left.shape[1]
     disparity, good = match_rows(
-        left, right, points, reach, _RULES.min_correlation, _RULES.min_margin
+        left, right, points, reach, _PROBE.min_correlation, ROW_SEARCH.min_margin
     )
-    return int((good & (disparity >= _RULES.min_signed_px)).sum())
+    return int((good & (disparity >= MIN_SIGNED_PX)).sum())
 
 
 def _between_rows(image: Image, rows: float) -> Image:

@@ -37,7 +37,7 @@ from vio.records import BoolArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class _Finding:
+class _PlaceRules:
     """What finds and proves a place."""
 
     candidates: int = 3  # keyframes that are compared by geometry
@@ -68,7 +68,7 @@ class _Finding:
     shown: int = 64
 
 
-_FINDING = _Finding()
+_PLACES = _PlaceRules()
 _VIEW_RAD = float(np.radians(70.0))
 _SIGMAS = 3.0
 GATE = float(chi_square_quantile(0.999, 6))
@@ -89,7 +89,7 @@ class FoundPlace:
         """Whether it shows enough to need one confirmation alone where nothing else is known of
         the place.
         """
-        return self.seen.inliers >= _FINDING.sure_inliers
+        return self.seen.inliers >= _PLACES.sure_inliers
 
 
 class PlaceFinder:
@@ -130,7 +130,7 @@ class PlaceFinder:
         self._store = store
         self._index = PlaceIndex()
         self._overlaps = Overlaps()
-        self._shown = lru_cache(_FINDING.shown)(self._read_shown)
+        self._shown = lru_cache(_PLACES.shown)(self._read_shown)
         self._restore(keyframes)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -239,16 +239,16 @@ class PlaceFinder:
             allowed: (K,) keyframes that may be found.
             drift: (K, 6, 6) covariance of the odometry since each of them.
         """
-        candidates = self._index.candidates(features.descriptors, allowed, _FINDING.candidates)
+        candidates = self._index.candidates(features.descriptors, allowed, _PLACES.candidates)
         found: list[FoundPlace] = []
         for i in candidates.tolist():
             camera = self._graph.sessions[int(self._graph.session[i])].camera
             seen = verify(camera, self.features(i), self._camera, features)
             if seen is None or not self.fits(i, number, seen, drift[i]):
                 continue
-            far = drift[i, :3, :3].trace() > _FINDING.lost_m**2
-            lost = far and seen.inliers < _FINDING.sure_inliers
-            needed = _FINDING.confirmations_lost if lost else _FINDING.confirmations
+            far = drift[i, :3, :3].trace() > _PLACES.lost_m**2
+            lost = far and seen.inliers < _PLACES.sure_inliers
+            needed = _PLACES.confirmations_lost if lost else _PLACES.confirmations
             found.append(FoundPlace(i, number, seen, needed))
         return found
 
@@ -285,14 +285,14 @@ class PlaceFinder:
         first, *others = places
         views = self._views(first, first)
         for i in others:
-            views += self._views(i, first, reach=_FINDING.guided_others)
+            views += self._views(i, first, reach=_PLACES.guided_others)
         seen = search(place_points(views), self._camera, features, prior, prior)
         if seen is None:
             return None
         r = se3_log(se3_inverse(prior.T_i_j) @ seen.pose.T_i_j)
         if squared(r, prior.covariance + seen.pose.covariance) > GATE:
             return None
-        return _as_place(views, number, seen, features, _FINDING.confirmations)
+        return _as_place(views, number, seen, features, _PLACES.confirmations)
 
     def _priors(self, rows: IntArray, k: int) -> dict[int, RelativePose]:
         """Return where keyframe k stands in those of keyframes `rows` from which the odometry
@@ -300,8 +300,8 @@ class PlaceFinder:
         """
         graph = self._graph
         rows = rows[graph.part[rows] == graph.part[k]]
-        drift = self.drift_since(rows, k, systematic=_FINDING.guided_share)
-        known = np.flatnonzero(np.trace(drift[:, :3, :3], axis1=1, axis2=2) < _FINDING.guided_m**2)
+        drift = self.drift_since(rows, k, systematic=_PLACES.guided_share)
+        known = np.flatnonzero(np.trace(drift[:, :3, :3], axis1=1, axis2=2) < _PLACES.guided_m**2)
         T = se3_inverse(graph.T_map_cam[rows[known]]) @ graph.T_map_cam[k]
         return {int(rows[n]): RelativePose(T[m], drift[n]) for m, n in enumerate(known.tolist())}
 
@@ -311,23 +311,23 @@ class PlaceFinder:
         out = list[int]()
         score = np.zeros(len(self._index))
         score[rows] = self._overlaps.expected(rows, T[rows], self._camera, T[number])
-        kernel = np.ones(2 * _FINDING.guided_neighbours + 1)
+        kernel = np.ones(2 * _PLACES.guided_neighbours + 1)
         around = np.convolve(score, kernel)[
-            _FINDING.guided_neighbours : _FINDING.guided_neighbours + len(score)
+            _PLACES.guided_neighbours : _PLACES.guided_neighbours + len(score)
         ]
         around[score == 0] = 0.0
-        while len(out) < _FINDING.guided_places and around.max(initial=0.0) >= MIN_CORNERS:
+        while len(out) < _PLACES.guided_places and around.max(initial=0.0) >= MIN_CORNERS:
             middle = int(np.argmax(around))
             out.append(middle)
             around[
-                max(middle - 2 * _FINDING.guided_neighbours, 0) : middle
-                + 2 * _FINDING.guided_neighbours
+                max(middle - 2 * _PLACES.guided_neighbours, 0) : middle
+                + 2 * _PLACES.guided_neighbours
                 + 1
             ] = 0.0
         return out
 
     def _views(
-        self, i: int, origin: int, *, reach: int = _FINDING.guided_neighbours
+        self, i: int, origin: int, *, reach: int = _PLACES.guided_neighbours
     ) -> list[PlaceView]:
         """Return keyframe i and its neighbours in its session, with their motion from another
         keyframe.
@@ -356,11 +356,11 @@ class PlaceFinder:
         part = self._graph.part
         if (
             part[other.first] != part[best.first]
-            or other.seen.inliers < _FINDING.other_place * best.seen.inliers
+            or other.seen.inliers < _PLACES.other_place * best.seen.inliers
         ):
             return False
         gap = self._position(other) - self._position(best)
-        return float(np.linalg.norm(gap)) > _FINDING.same_m + _FINDING.same_depths * depth
+        return float(np.linalg.norm(gap)) > _PLACES.same_m + _PLACES.same_depths * depth
 
     def _position(self, loop: FoundPlace) -> FloatArray:
         """Position (3,) of the later keyframe in the map, as a loop says it."""
@@ -406,14 +406,14 @@ class PlaceFinder:
         passed = graph.path_m[number] - graph.path_m[:count]
         # large numbers cancel
         sigma = np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0))
-        near_path = (passed < _FINDING.revisit_depths * depth) & (sigma < _FINDING.lost_m)
-        recent = own & ((np.arange(count) > number - _FINDING.recent) | near_path)
+        near_path = (passed < _PLACES.revisit_depths * depth) & (sigma < _PLACES.lost_m)
+        recent = own & ((np.arange(count) > number - _PLACES.recent) | near_path)
         T = se3_inverse(graph.T_map_cam[number]) @ graph.T_map_cam[:count]
-        near = np.linalg.norm(T[:, :3, 3], axis=1) <= _FINDING.view_depths * depth + _SIGMAS * sigma
+        near = np.linalg.norm(T[:, :3, 3], axis=1) <= _PLACES.view_depths * depth + _SIGMAS * sigma
         ahead = np.arccos(np.clip(T[:, 2, 2], -1.0, 1.0)) <= _VIEW_RAD
         part = graph.part
         unknown = (part[:count] != part[number]) | (sigma > 0.5 * UNKNOWN**0.5)
-        return ~recent & (unknown | (near & (ahead | (sigma > _FINDING.lost_m))))
+        return ~recent & (unknown | (near & (ahead | (sigma > _PLACES.lost_m))))
 
     def fits(self, i: int, k: int, seen: Verified, drift: FloatArray) -> bool:
         """Whether a place agrees with the odometry, where that knows anything of it."""

@@ -26,7 +26,7 @@ from vio.geometry.lie import (
 )
 from vio.geometry.relative_pose import RelativePose
 from vio.numerics import sparse
-from vio.numerics.robust import truncated_weights
+from vio.numerics.robust import CUT_OFF_PROBABILITY, MU_GROWTH, truncated_weights
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
@@ -35,8 +35,6 @@ from vio.records import BoolArray, IntArray
 class _GncRules:
     """Graduated non-convexity."""
 
-    truncation: float = 0.999  # probability at which a loop's residual is cut off
-    mu_growth: float = 1.6  # of the control parameter, from one step to the next
     max_steps: int = 15
     max_gnc_steps: int = 30
     converged: float = 1e-6  # largest change, m and rad
@@ -110,7 +108,7 @@ def optimise(
             pitch follow the up_directions; None: all of them stay.
     """
     free = _Free(fixed, levelled)
-    limit = float(chi_square_quantile(_GNC.truncation, 6))
+    limit = float(chi_square_quantile(CUT_OFF_PROBABILITY, 6))
     T = T_map_cam.copy()
     weight = np.ones(len(loops))
     if not len(loops):
@@ -130,7 +128,7 @@ def optimise(
             squared = _squared(T, loops)
             if ((weight == 0) | (weight == 1)).all() and mu > 1:
                 break
-            mu *= _GNC.mu_growth
+            mu *= MU_GROWTH
         weight = (squared < limit).astype(np.float64)
         T = _descend(T, odometry, loops, weight, up_directions, free, _GNC.max_steps)
     return Optimum(T, weight > 0.5, weight)

@@ -44,7 +44,7 @@ class _RigRules(NamedTuple):
 _RIG = _RigRules()
 
 
-class _StateRules(NamedTuple):
+class _PossibleRules(NamedTuple):
     """When an estimate is impossible."""
 
     restart_event_s: float = 1.0  # restarts that follow each other within this time are one event
@@ -53,7 +53,7 @@ class _StateRules(NamedTuple):
     max_accel_bias_mps2: float = 3.0
 
 
-_POSSIBLE = _StateRules()
+_POSSIBLE = _PossibleRules()
 _STATE = ("speed", "gyro bias", "accelerometer bias")  # what is implausible of a state
 _SCALES = ("baseline", "focal length")
 

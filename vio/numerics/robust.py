@@ -77,6 +77,12 @@ def jackknife(values: npt.ArrayLike) -> FloatArray:
     return out
 
 
+# Graduated non-convexity: the probability at which a residual is cut off, and what `mu` grows by
+# from one step to the next.
+CUT_OFF_PROBABILITY = 0.999
+MU_GROWTH = 1.6
+
+
 def truncated_weights(
     squared: FloatArray, mu: FloatArray | float, limit: FloatArray | float
 ) -> FloatArray:

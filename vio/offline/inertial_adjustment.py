@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.sparse import (
@@ -34,35 +35,37 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, so3_
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
 from vio.numerics import sparse
+from vio.numerics.least_squares import Damping
 from vio.offline.points import MIN_DEPTH_M, PointTracks
 from vio.records import FIELD_TERMS, ROW_TERMS, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class _Rules:
+class _AdjustmentRules:
     """How an adjustment with the IMU descends."""
 
     # states of a keyframe: xi of its pose, velocity, biases of gyro and accelerometer
     own: int = 15
-    width: float = 3.0  # standard deviations at which a row's weight is a quarter …
-    wider: int = 2  # … doubled in so many first steps, once each
-    settled: int = 7  # steps after which neither width nor preintegration change
+    width_sigmas: float = 3.0  # standard deviations at which a row's weight is a quarter …
+    wider_steps: int = 2  # … doubled in so many first steps, once each
+    settled_steps: int = 7  # steps after which neither width nor preintegration change
     # of the cost, from step to step: what goes on is rows that turn into outliers, and moves no
     # pose
-    converged: float = 1e-4
+    converged_share: float = 1e-4
+    max_steps: int = 25
+    first_damping: float = 1e-6
     max_damping: float = 1e3
     # tracks that end within it in one cell of directions share their errors, as in (R7)
     cell_s: float = 1.0
     # inverse standard deviation, 1/m and 1/rad, of position and heading of the first keyframe
-    gauge: float = 1e4
+    gauge_weight: float = 1e4
 
 
-_RULES = _Rules()
+_ADJUSTMENT = _AdjustmentRules()
 _FIELD = FIELD_TERMS + ROW_TERMS
 _METRIC_COLUMNS: IntArray = np.arange(FIELD_TERMS, FIELD_TERMS + METRIC_TERMS + 2)
 # Field, baseline, focal length, centre, extrinsics, time, accelerometer.
 _SHARED = _FIELD + METRIC_TERMS + 2 + 6 + 1 + 1
-_STEPS = 25
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,41 +142,43 @@ class InertialAdjustment:
         covariance = np.zeros((0, 6, 6))
         if covariance_of is not None:
             progress()
-            system = self._system(at, steps, _RULES.width)
+            system = self._system(at, steps, _ADJUSTMENT.width_sigmas)
             covariance = system.covariance(
                 self._cameras_by_states(at, covariance_of), self._clusters()
             )
-        pixels = float(np.mean(squared[squared < _RULES.width**2])) / 3
+        pixels = float(np.mean(squared[squared < _ADJUSTMENT.width_sigmas**2])) / 3
         return Optimum(at, converged, pixels, float(np.mean(r**2)), covariance)
 
     def _descend(
         self, body: BodyStates, progress: Callable[[], None]
     ) -> tuple[Fit, Preintegrated, bool]:
         at = Fit(body, self.tracks.p_world, np.zeros(_SHARED))
-        damping = 1e-6
+        damping = Damping(_ADJUSTMENT.first_damping, _ADJUSTMENT.max_damping)
         steps = self._preintegrated(body)
-        for n in range(_STEPS):
+        for n in range(_ADJUSTMENT.max_steps):
             progress()
-            width = _RULES.width * 2.0 ** max(_RULES.wider - n, 0)
+            width = _ADJUSTMENT.width_sigmas * 2.0 ** max(_ADJUSTMENT.wider_steps - n, 0)
             if n in (1, 3, 6):
                 steps = self._preintegrated(at.body)
             system = self._system(at, steps, width)
             before = self._cost(at, steps, width)
-            while True:
-                step = system.step(damping)
-                new = self._moved(at, *step)
-                after = self._cost(new, steps, width)
-                if after <= before:
-                    break
-                damping *= 10
-                if damping > _RULES.max_damping:
-                    # no step is shorter: rounding is all that is left
-                    return at, steps, n > _RULES.settled
-            at = new
-            damping = max(damping / 10, 1e-9)
-            if n > _RULES.settled and before - after < _RULES.converged * before:
+            new = damping.step(
+                partial(self._after_step, at, system),
+                partial(self._cost, steps=steps, width=width),
+                before,
+            )
+            if new is None:
+                return at, steps, n > _ADJUSTMENT.settled_steps
+            at, after = new
+            if (
+                n > _ADJUSTMENT.settled_steps
+                and before - after < _ADJUSTMENT.converged_share * before
+            ):
                 return at, steps, True
         return at, steps, False
+
+    def _after_step(self, at: Fit, system: _System, damping: float) -> Fit:
+        return self._moved(at, *system.step(damping))
 
     def corrected_pixels(self, at: Fit) -> FloatArray:
         """Return the rows' pixels (R, 4) without what the rig is off by; right rows stay as they
@@ -220,17 +225,17 @@ class InertialAdjustment:
         cam_D_imu = se3_adjoint(
             se3_inverse(self.cameras(at)[keyframes]) @ at.body.T_world_imu[keyframes]
         )
-        out = np.zeros((len(keyframes), 6, _RULES.own + _SHARED))
+        out = np.zeros((len(keyframes), 6, _ADJUSTMENT.own + _SHARED))
         out[:, :, :6] = cam_D_imu
-        out[:, :, _RULES.own + first : _RULES.own + first + 6] = (
+        out[:, :, _ADJUSTMENT.own + first : _ADJUSTMENT.own + first + 6] = (
             -se3_adjoint(self.T_cam0_imu) * self.prior.extrinsics
         )
         twists = self.prior.time_s * self._twists(at)[keyframes]
-        out[:, :, _RULES.own + first + 6] = np.einsum("cij,cj->ci", cam_D_imu, twists)
+        out[:, :, _ADJUSTMENT.own + first + 6] = np.einsum("cij,cj->ci", cam_D_imu, twists)
         own = _blocks(
-            np.arange(len(keyframes)), keyframes, out[:, :, : _RULES.own], len(keyframes), K
+            np.arange(len(keyframes)), keyframes, out[:, :, : _ADJUSTMENT.own], len(keyframes), K
         )
-        return hstack([own, csr_matrix(out[:, :, _RULES.own :].reshape(-1, _SHARED))]).tocsr()
+        return hstack([own, csr_matrix(out[:, :, _ADJUSTMENT.own :].reshape(-1, _SHARED))]).tocsr()
 
     def _clusters(self) -> IntArray:
         """Return numbers (M,) of the clusters of points: where and when their tracks end."""
@@ -241,7 +246,7 @@ class InertialAdjustment:
         across, down = (tracks.z[last, :2] - [c.cu, c.cv]).T / [[c.fu], [c.fv]]
         seconds = self.seconds[tracks.keyframe[last]]
         cells = np.stack(
-            [np.arctan(across) / CELL_RAD, np.arctan(down) / CELL_RAD, seconds / _RULES.cell_s]
+            [np.arctan(across) / CELL_RAD, np.arctan(down) / CELL_RAD, seconds / _ADJUSTMENT.cell_s]
         )
         return np.asarray(np.unique(np.floor(cells), axis=1, return_inverse=True)[1]).ravel()
 
@@ -304,7 +309,7 @@ class InertialAdjustment:
         tracks = self.tracks
         K = len(self.seconds)
         count = len(self.tracks.point)
-        columns = _RULES.own * K + _SHARED
+        columns = _ADJUSTMENT.own * K + _SHARED
         r, q, r_D_rig = self._pixels(at)
         squared = np.sum(r**2, axis=1) / self.sigma_px**2
         weight = 1 / (self.sigma_px * (1 + squared / (3 * width**2)))
@@ -340,14 +345,14 @@ class InertialAdjustment:
         r, A, B = self._scaled(at, steps).linearised(i, j, self.gravity_mps2)
         W = _whitening(steps)
         n = np.arange(F)
-        own = _RULES.own * K
+        own = _ADJUSTMENT.own * K
         S = np.zeros((F, 9, _SHARED))
         S[:, 3:6, -1] = -self.prior.accel_scale * steps.v
         S[:, 6:, -1] = -self.prior.accel_scale * steps.p
         imu = _blocks(n, n, W @ A, F, K) + _blocks(n, n + 1, W @ B, F, K)
         parts = [hstack([imu, csr_matrix((W @ S).reshape(9 * F, _SHARED))])]
         errors = [np.einsum("fij,fj->fi", W, r).ravel()]
-        walk = np.zeros((F, 6, _RULES.own))
+        walk = np.zeros((F, 6, _ADJUSTMENT.own))
         walk[:, np.arange(6), 9 + np.arange(6)] = 1 / self._walk_sigmas()
         walks = _blocks(n, n + 1, walk, F, K) - _blocks(n, n, walk, F, K)
         parts.append(hstack([walks, csr_matrix((6 * F, _SHARED))]))
@@ -360,8 +365,8 @@ class InertialAdjustment:
         errors.append(self.prior.at_start + at.rig)
         gauge = np.zeros((4, columns))
         R = at.body.T_world_imu[0, :3, :3]
-        gauge[:3, :3] = _RULES.gauge * R
-        gauge[3, 3:6] = _RULES.gauge * R[2]
+        gauge[:3, :3] = _ADJUSTMENT.gauge_weight * R
+        gauge[3, 3:6] = _ADJUSTMENT.gauge_weight * R[2]
         parts.append(csr_matrix(gauge))
         errors.append(np.zeros(4))
         return vstack(parts).tocsr(), np.concatenate(errors)
@@ -396,8 +401,8 @@ class _System:
         """Return the changes of the keyframes (K, 15), points (M, 3) and rig (27,)."""
         N, g, points = self._reduced(damping)
         x = -sparse.factors(N)(g)
-        own = x[: _RULES.own * self.keyframes].reshape(-1, _RULES.own)
-        s = x[_RULES.own * self.keyframes :]
+        own = x[: _ADJUSTMENT.own * self.keyframes].reshape(-1, _ADJUSTMENT.own)
+        s = x[_ADJUSTMENT.own * self.keyframes :]
         by_poses = (points.by_pose.T @ own[:, :6].ravel()).reshape(-1, 3)
         p = -np.einsum("mij,mj->mi", points.V_inverse, points.e + by_poses + points.by_rig @ s)
         return own, p, s
@@ -412,7 +417,9 @@ class _System:
         N, _, points = self._reduced(0.0)
         e = self._without_points(points)
         rows = np.arange(len(self.e))
-        own = np.pad(np.einsum("rai,ra->ri", self.own, e), ((0, 0), (0, _RULES.own - 6)))[:, None]
+        own = np.pad(np.einsum("rai,ra->ri", self.own, e), ((0, 0), (0, _ADJUSTMENT.own - 6)))[
+            :, None
+        ]
         of_poses = _blocks(rows, self.tracks.keyframe, own, len(rows), self.keyframes)
         scores = hstack([of_poses, csr_matrix(np.einsum("rai,ra->ri", self.rig, e))])
         summed = csr_matrix((np.ones(len(rows)), (clusters[self.tracks.point], rows))) @ scores
@@ -451,16 +458,16 @@ class _System:
         rig = _product(self.rig, self.rig) - _product(W_rig, V_rig)
         eliminated = _Points(V_inverse, V_e, by_point, W_rig)
         e = self._without_points(eliminated)
-        g = np.zeros(_RULES.own * K + _SHARED)
-        g[: _RULES.own * K].reshape(K, _RULES.own)[:, :6] = _sums(
+        g = np.zeros(_ADJUSTMENT.own * K + _SHARED)
+        g[: _ADJUSTMENT.own * K].reshape(K, _ADJUSTMENT.own)[:, :6] = _sums(
             keyframe, np.einsum("rai,ra->ri", self.own, e), K
         )
-        g[_RULES.own * K :] = np.einsum("rai,ra->i", self.rig, e)
+        g[_ADJUSTMENT.own * K :] = np.einsum("rai,ra->i", self.rig, e)
         g += self.others.T @ self.other_e
         places = np.concatenate(
             [
-                (_RULES.own * np.arange(K)[:, None] + np.arange(6)).ravel(),
-                _RULES.own * K + np.arange(_SHARED),
+                (_ADJUSTMENT.own * np.arange(K)[:, None] + np.arange(6)).ravel(),
+                _ADJUSTMENT.own * K + np.arange(_SHARED),
             ]
         )
         seen = block_array([[poses, mixed], [mixed.T, rig]], format="coo")

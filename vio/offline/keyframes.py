@@ -20,7 +20,7 @@ _MIN_DISPARITY_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class _Rules:
+class _KeyframeRules:
     """Which frames of a run become keyframes."""
 
     all_frames: int = 300  # in a shorter run, every frame is a keyframe
@@ -32,7 +32,7 @@ class _Rules:
     loop_share: int = 3  # of the keyframes that may be spent on loops: one in three
 
 
-_RULES = _Rules()
+_KEYFRAMES = _KeyframeRules()
 _TURN_DEG = 6.0  # … or rotation to it
 
 
@@ -78,8 +78,8 @@ def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
         raise DataError(
             f"{run.where}: a run of {len(T)} frames has fewer than two views; process more frames"
         )
-    step_m = _RULES.scene_share * _median_depth_m(run)
-    if len(T) <= (_RULES.all_frames if most is None else most):
+    step_m = _KEYFRAMES.scene_share * _median_depth_m(run)
+    if len(T) <= (_KEYFRAMES.all_frames if most is None else most):
         return np.arange(len(T))
     ends = loop_ends(run, most)
     factor = 1.0
@@ -89,7 +89,7 @@ def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
             chosen.append(len(T) - 1)
         if most is None or len(chosen) + len(ends) <= max(most, 2):
             return np.union1d(np.array(chosen, dtype=np.int64), ends)
-        factor *= _RULES.sparser
+        factor *= _KEYFRAMES.sparser
 
 
 def after_motion(T: FloatArray, step_m: float, turn_deg: float) -> list[int]:
@@ -126,13 +126,17 @@ def keyframes_by_overlap(run: TrackedPath, *, most: int) -> IntArray:
         return np.arange(len(run.frames))
     ends = loop_ends(run, most)
     ids = [run.fresh(k).ids for k in range(len(run.frames))]
-    shown = [k for k in range(len(ids)) if k in (0, len(ids) - 1) or len(ids[k]) >= _RULES.min_seen]
+    shown = [
+        k for k in range(len(ids)) if k in (0, len(ids) - 1) or len(ids[k]) >= _KEYFRAMES.min_seen
+    ]
     lost = [
         1 - np.isin(ids[a], ids[b]).mean() if len(ids[a]) else 0.0
         for a, b in itertools.pairwise(shown)
     ]
     total = np.concatenate([[0.0], np.cumsum(lost)])
-    count = int(np.clip(np.ceil(total[-1] / _RULES.lost_share) + 1, 2, max(most - len(ends), 2)))
+    count = int(
+        np.clip(np.ceil(total[-1] / _KEYFRAMES.lost_share) + 1, 2, max(most - len(ends), 2))
+    )
     chosen = np.searchsorted(total, np.linspace(0, total[-1], count)).clip(0, len(shown) - 1)
     return np.union1d(np.array(shown)[np.append(chosen, len(shown) - 1)], ends)
 
@@ -143,7 +147,7 @@ def loop_ends(run: TrackedPath, most: int | None) -> IntArray:
     """
     pairs = loop_pairs(run.loops, run.frames)
     if most is not None:
-        count = min(len(pairs), most // (2 * _RULES.loop_share))
+        count = min(len(pairs), most // (2 * _KEYFRAMES.loop_share))
         pairs = (
             pairs[np.linspace(0, len(pairs) - 1, count).astype(np.int64)] if count else pairs[:0]
         )
@@ -189,7 +193,7 @@ def tracked_segments(
         for part in np.split(rows, breaks)
         for k in range(0, len(part), longest)
     ]
-    parts = [part for part in parts if len(part) >= min(longest, _RULES.min_stretch)]
+    parts = [part for part in parts if len(part) >= min(longest, _KEYFRAMES.min_stretch)]
     if not parts:
         return []
     out: list[TrackedPath] = []

@@ -41,7 +41,7 @@ class _MeshRules:
     level: float = 0.9998
 
 
-_RULES = _MeshRules()
+_DEPTHS = _MeshRules()
 _SIGMA_VOXELS = float(TRUNCATION)  # of a depth, beyond which it is not used
 
 
@@ -82,7 +82,7 @@ def _depth_and_voxel_m(
     the samples, and this distance, or that which fits the depth.
     """
     if voxel_m is not None:
-        return _landmark_depth_m(folder, T_world_cam0, voxel_m / _RULES.voxel_share), voxel_m
+        return _landmark_depth_m(folder, T_world_cam0, voxel_m / _DEPTHS.voxel_share), voxel_m
     depth_m = _landmark_depth_m(folder, T_world_cam0, None)
     return depth_m, _voxel_m(camera, depth_m)
 
@@ -119,7 +119,9 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
         else _poses_in_map(map_file, by_odometry)
     )
     depth_m, voxel_m = _depth_and_voxel_m(folder, images.camera, T_odom, voxel_m)
-    chosen = np.array(after_motion(T, _RULES.step_share * depth_m, _RULES.step_deg), dtype=np.int64)
+    chosen = np.array(
+        after_motion(T, _DEPTHS.step_share * depth_m, _DEPTHS.step_deg), dtype=np.int64
+    )
     up_odom = up_of_odometry(folder, metrics)
     up = None if up_odom is None else up_in(T, T_odom, up_odom)
     poses = "map" if mapped or map_file is not None else "odometry"
@@ -172,7 +174,7 @@ def build_mesh(
             "voxels with --voxel, and see whether the run's poses are right"
         )
     R = upright_axes(made_from.T_world_cam0, made_from.up_world)
-    if made_from.up_world is not None and made_from.up_world[2] > _RULES.level:
+    if made_from.up_world is not None and made_from.up_world[2] > _DEPTHS.level:
         R = np.eye(3)  # the floor plan is in the run's own frame, whose z is up
     picture = preview(mesh, made_from.T_world_cam0[:done, :3, 3], R, voxel_m)
     return DenseMap(mesh, occupancy_grid(mesh, R, voxel_m), picture, R, done, blocks)
@@ -234,7 +236,7 @@ def _landmark_depth_m(folder: Path, T_world_cam0: FloatArray, otherwise_m: float
         transform_points(se3_inverse(T), p)[:, 2]
         for T in T_world_cam0[:: max(1, len(T_world_cam0) // 50)]
     ]
-    ahead = [float(np.quantile(z[z > 0], _RULES.near_quantile)) for z in depths if (z > 0).any()]
+    ahead = [float(np.quantile(z[z > 0], _DEPTHS.near_quantile)) for z in depths if (z > 0).any()]
     if not ahead and otherwise_m is not None:
         return otherwise_m
     if not ahead:
@@ -249,7 +251,9 @@ def _voxel_m(camera: StereoCamera, depth_m: float) -> float:
     """Return voxels with which surfaces are used at twice the landmarks' depth: 1, 2 or 5 times
     a power of ten.
     """
-    length_m = max(_RULES.voxel_share * depth_m, depth_sigma_m(camera, 2 * depth_m) / _SIGMA_VOXELS)
+    length_m = max(
+        _DEPTHS.voxel_share * depth_m, depth_sigma_m(camera, 2 * depth_m) / _SIGMA_VOXELS
+    )
     power = 10.0 ** np.floor(np.log10(length_m))
     return float(power * max(m for m in (1, 2, 5) if m * power <= length_m * (1 + 1e-9)))
 

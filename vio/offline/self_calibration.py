@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from vio.calibration.stereo_field import PARAMETERS
 from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.least_squares import Damping
 from vio.numerics.robust import robust_sigma
 from vio.offline.points import MIN_DEPTH_M, PointTracks, keep_rows
 from vio.records import BoolArray, IntArray
@@ -56,7 +58,7 @@ INTRINSICS = ("focal", "aspect", "cu", "cv")
 
 
 @dataclass(frozen=True, slots=True)
-class _Rules:
+class _RefinementRules:
     """How a calibration is refined by its own images."""
 
     # What lens models leave, beside the scatter: this and the sliding window differ by so much on
@@ -64,21 +66,22 @@ class _Rules:
     lens_deg: float = 0.01
     lens_direction_deg: float = 0.3
     held: float = 1e-9  # standard deviation of what is not free
-    steps: int = 30  # of Levenberg-Marquardt, at most
+    max_steps: int = 30  # of Levenberg-Marquardt
     first_damping: float = 1e-4  # over the diagonal of the information
     min_damping: float = 1e-10
-    settled: float = 1e-6  # relative decrease of the cost at which the steps end
+    max_damping: float = 1e4
+    converged_share: float = 1e-6  # relative change of the cost
     # robust standard deviation above which the tracks are not of one rigid scene and rig
-    largest_residual_px: float = 1.5
-    cauchy: float = 2.0  # residuals of so many standard deviations count half
-    gate: float = 5.0  # rows with larger residuals, in standard deviations, are left out
+    max_residual_px: float = 1.5
+    cauchy_sigmas: float = 2.0  # residuals of so many standard deviations count half
+    gate_sigmas: float = 5.0  # rows with larger residuals, in standard deviations, are left out
     # of a point's information, against rounding; more of it passes for knowledge of depths
     rounding: float = 1e-12
     cells: tuple[int, int] = (8, 4)  # regions of the image, along u and v
     min_residual_px: float = 0.02  # of exact tracks, so that weights stay finite
 
 
-_RULES = _Rules()
+_REFINEMENT = _RefinementRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +131,8 @@ class SelfCalibration:
         return (
             so3_exp(off[:3]),
             direction / np.linalg.norm(direction),
-            float(np.hypot(rotation, _RULES.lens_deg)),
-            float(np.hypot(swing, _RULES.lens_direction_deg)),
+            float(np.hypot(rotation, _REFINEMENT.lens_deg)),
+            float(np.hypot(swing, _REFINEMENT.lens_direction_deg)),
         )
 
     def after(self, parameters: FloatArray) -> SelfCalibration:
@@ -154,7 +157,8 @@ class SelfCalibration:
         gradient = np.where(np.isin(NAMES, INTRINSICS), 0.0, J[0, 0] - J[0, 2])
         z = project_off(camera, x, np.array([[0.0, 0.0, depth_m]]))[0]
         sigma = np.hypot(
-            np.sqrt(gradient @ self.covariance @ gradient), camera.fu * np.radians(_RULES.lens_deg)
+            np.sqrt(gradient @ self.covariance @ gradient),
+            camera.fu * np.radians(_REFINEMENT.lens_deg),
         )
         return float(z[0] - z[2] - disparity_px), float(sigma)
 
@@ -232,10 +236,10 @@ def self_calibrate(
     pieces = [s for s in segments if len(s.tracks.ids)]
     if not pieces:
         raise EstimationError("not observable because no track is consistent over the keyframes")
-    width = np.where(np.isin(NAMES, INTRINSICS) & (not intrinsics), _RULES.held, _PRIOR)
+    width = np.where(np.isin(NAMES, INTRINSICS) & (not intrinsics), _REFINEMENT.held, _PRIOR)
     x, pieces = _optimum(camera, x, pieces, width)
     sigma = _spread(camera, x, pieces)
-    if sigma > _RULES.largest_residual_px:
+    if sigma > _REFINEMENT.max_residual_px:
         raise EstimationError(
             f"not observable because tracks and motion disagree by {sigma:.1f} px"
         )
@@ -249,27 +253,39 @@ def _optimum(
     camera: StereoCamera, x: FloatArray, pieces: list[Segment], width: FloatArray
 ) -> tuple[FloatArray, list[Segment]]:
     """Return parameters (18,) and segments at the least robust cost, by Levenberg-Marquardt."""
-    damping = _RULES.first_damping
-    for _ in range(_RULES.steps):
+    damping = Damping(_REFINEMENT.first_damping, _REFINEMENT.max_damping, _REFINEMENT.min_damping)
+    for _ in range(_REFINEMENT.max_steps):
         sigma = _spread(camera, x, pieces)
-        prior = np.diag(1 / (width**2 + x**2))
-        solved = [_normal_equations(camera, x, piece, sigma, damping) for piece in pieces]
-        A = np.sum([n.A for n in solved], axis=0) + prior
-        dx = np.linalg.solve(
-            A + damping * np.diag(np.diag(A)), np.sum([n.b for n in solved], axis=0) - prior @ x
+        before = _cost(camera, sigma, width, (x, pieces))
+        new = damping.step(
+            partial(_after_step, camera, x, pieces, sigma, width),
+            partial(_cost, camera, sigma, width),
+            before,
         )
-        moved = [n.moved(piece, dx) for n, piece in zip(solved, pieces, strict=True)]
-        before = _cost(camera, x, pieces, sigma, width)
-        after = _cost(camera, x + dx, moved, sigma, width)
-        if after < before:
-            x = x + dx
-            pieces = moved
-            damping = max(damping / 30, _RULES.min_damping)
-        else:
-            damping = 10 * max(damping, 1e-8)
-        if abs(before - after) < _RULES.settled * before:
+        if new is None:
+            break
+        (x, pieces), after = new
+        if before - after < _REFINEMENT.converged_share * before:
             break
     return x, pieces
+
+
+def _after_step(
+    camera: StereoCamera,
+    x: FloatArray,
+    pieces: Sequence[Segment],
+    sigma: float,
+    width: FloatArray,
+    damping: float,
+) -> tuple[FloatArray, list[Segment]]:
+    """Return parameters (18,) and segments after a step with so much damping."""
+    prior = np.diag(1 / (width**2 + x**2))
+    solved = [_normal_equations(camera, x, piece, sigma, damping) for piece in pieces]
+    A = np.sum([n.A for n in solved], axis=0) + prior
+    dx = np.linalg.solve(
+        A + damping * np.diag(np.diag(A)), np.sum([n.b for n in solved], axis=0) - prior @ x
+    )
+    return x + dx, [n.moved(piece, dx) for n, piece in zip(solved, pieces, strict=True)]
 
 
 def _with_covariance(
@@ -296,17 +312,22 @@ def _spread(camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment]) -> f
     """Return the robust standard deviation of a pixel coordinate."""
     return max(
         robust_sigma(np.concatenate([_residuals(camera, x, s)[1] for s in pieces])),
-        _RULES.min_residual_px,
+        _REFINEMENT.min_residual_px,
     )
 
 
 def _cost(
-    camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment], sigma: float, width: FloatArray
+    camera: StereoCamera,
+    sigma: float,
+    width: FloatArray,
+    moved: tuple[FloatArray, Sequence[Segment]],
 ) -> float:
     """Return what the steps decrease: Cauchy losses of rows and parameters (18,)."""
+    x, pieces = moved
     squares = [np.sum(_residuals(camera, x, piece)[0] ** 2, axis=1) / sigma**2 for piece in pieces]
+    width_squared = _REFINEMENT.cauchy_sigmas**2
     rows = sum(
-        float(np.sum(2 * _RULES.cauchy**2 * np.log1p(q / (4 * _RULES.cauchy**2)))) for q in squares
+        float(np.sum(2 * width_squared * np.log1p(q / (4 * width_squared)))) for q in squares
     )
     return rows + 0.5 * float(np.sum(np.log1p(x**2 / width**2)))
 
@@ -340,7 +361,7 @@ def _residuals(
 
 def _without_outliers(camera: StereoCamera, x: FloatArray, piece: Segment, sigma: float) -> Segment:
     r, _, _ = _residuals(camera, x, piece)
-    kept = keep_rows(piece.tracks, np.abs(r).max(axis=1) < _RULES.gate * sigma)
+    kept = keep_rows(piece.tracks, np.abs(r).max(axis=1) < _REFINEMENT.gate_sigmas * sigma)
     return replace(piece, tracks=kept) if len(kept.ids) else piece
 
 
@@ -380,9 +401,10 @@ def _normal_equations(
     J_x[~tracks.has_right, 2:] = 0
     root = (
         1
-        / (sigma * np.sqrt(1 + np.sum(r**2, axis=1) / (4 * _RULES.cauchy**2 * sigma**2)))[
-            :, None, None
-        ]
+        / (
+            sigma
+            * np.sqrt(1 + np.sum(r**2, axis=1) / (4 * _REFINEMENT.cauchy_sigmas**2 * sigma**2))
+        )[:, None, None]
     )
     r = r * root[:, 0]
     J_q = J_q * root
@@ -407,7 +429,7 @@ def _normal_equations(
     gradient[tracks.point, tracks.keyframe] = (r[:, None] @ J_pose)[:, 0]
     g_c[:, : 6 * K] = gradient.reshape(M, 6 * K)
     g_c[:, 6 * K :] = _sums((r[:, None] @ J_x)[:, 0], tracks.point, M)
-    H_pp += _RULES.rounding * np.trace(H_pp, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    H_pp += _REFINEMENT.rounding * np.trace(H_pp, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     H_pp[:, range(3), range(3)] *= 1 + damping
     H_cc[range(6 * K), range(6 * K)] *= 1 + damping
     return _eliminated(H_pp, H_pc, g_p, g_c, H_cc, _regions(camera, tracks))
@@ -505,9 +527,9 @@ def _regions(camera: StereoCamera, tracks: PointTracks) -> IntArray:
     u, v = (np.bincount(tracks.point, tracks.z[:, k], len(tracks.ids)) / count for k in (0, 1))
     width = camera.width or float(u.max()) + 1
     height = camera.height or float(v.max()) + 1
-    column = np.clip(_RULES.cells[0] * u / width, 0, _RULES.cells[0] - 1).astype(np.int64)
-    row = np.clip(_RULES.cells[1] * v / height, 0, _RULES.cells[1] - 1).astype(np.int64)
-    return np.asarray(_RULES.cells[0] * row + column, dtype=np.int64)
+    column = np.clip(_REFINEMENT.cells[0] * u / width, 0, _REFINEMENT.cells[0] - 1).astype(np.int64)
+    row = np.clip(_REFINEMENT.cells[1] * v / height, 0, _REFINEMENT.cells[1] - 1).astype(np.int64)
+    return np.asarray(_REFINEMENT.cells[0] * row + column, dtype=np.int64)
 
 
 def _eliminated(

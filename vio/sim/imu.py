@@ -14,13 +14,12 @@ import numpy as np
 
 from vio.datasets.samples import velocity_samples
 from vio.geometry.lie import FloatArray
-from vio.records import ImuDensities, ImuRecord, IntArray, VelocitySample
+from vio.records import S_PER_NS, ImuDensities, ImuRecord, IntArray, VelocitySample
 from vio.setting import setting
 from vio.sim.motion import MotionSpline, motion_at
 
 GRAVITY_MPS2 = 9.81
 GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_MPS2])
-_S_PER_NS = 1e-9
 # EuRoC's figures
 ADIS16448 = ImuDensities(gyro=1.6968e-4, gyro_walk=1.9393e-5, accel=2.0e-3, accel_walk=3.0e-3)
 
@@ -57,7 +56,7 @@ class VelocityNoise:
 
 def sample_times(spline: MotionSpline, rate_hz: float) -> IntArray:
     """Times (N,) at a fixed rate from the motion's start to its end."""
-    count = int((spline.end_ns - spline.start_ns) * _S_PER_NS * rate_hz + 1e-9) + 1
+    count = int((spline.end_ns - spline.start_ns) * S_PER_NS * rate_hz + 1e-9) + 1
     times = spline.start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     return times[times <= spline.end_ns]
 

@@ -24,11 +24,10 @@ from vio.errors import DataError, SimulationError
 from vio.files.text import check_increasing
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log
-from vio.records import BoolArray, IntArray
+from vio.records import S_PER_NS, BoolArray, IntArray
 
 logger = logging.getLogger(__name__)
 
-_S_PER_NS = 1e-9
 _DEGREE = 5
 _K = _DEGREE + 1  # control points that a pose depends on
 
@@ -75,7 +74,7 @@ class MotionSpline:
     def end_ns(self) -> int:
         """Last nanosecond at which the motion is defined."""
         return self.start_ns + int(
-            np.floor((len(self.p_control) - _DEGREE) * self.knot_s / _S_PER_NS)
+            np.floor((len(self.p_control) - _DEGREE) * self.knot_s / S_PER_NS)
         )
 
 
@@ -138,7 +137,7 @@ def _locate(spline: MotionSpline, times_ns: npt.ArrayLike) -> tuple[IntArray, In
             f"requested {t.min()} to {t.max()}: shorten the request or lengthen the trajectory"
         )
     position: FloatArray = np.multiply(
-        t - spline.start_ns, _S_PER_NS / spline.knot_s, dtype=np.float64
+        t - spline.start_ns, S_PER_NS / spline.knot_s, dtype=np.float64
     )
     segments = len(spline.p_control) - _DEGREE
     first = np.clip(np.floor(position).astype(np.int64), 0, segments - 1)
@@ -186,10 +185,10 @@ def fit_spline(
         DataError: times do not increase, values are not finite, or there are too few poses.
     """
     t, T = _check_record(times_ns, T_world_imu)
-    span = (t[-1] - t[0]) * _S_PER_NS
+    span = (t[-1] - t[0]) * S_PER_NS
     segments = max(1, int(np.ceil(span / knot_s - 1e-9)))
     step = span / segments * (1 + 1e-12)
-    position = np.minimum((t - t[0]) * _S_PER_NS / step, segments - 1e-9)
+    position = np.minimum((t - t[0]) * S_PER_NS / step, segments - 1e-9)
     first = np.floor(position).astype(np.int64)
     weights = _weights(position - first, 0)
     columns = (first[:, None] + np.arange(_K)).ravel()
@@ -296,7 +295,7 @@ def spline_from_waypoints(
         DataError: fewer than two waypoints, or one is not finite.
     """
     T = np.asarray(T_world_imu, dtype=np.float64)
-    times = start_ns + np.round(np.arange(len(T)) * (interval_s / _S_PER_NS)).astype(np.int64)
+    times = start_ns + np.round(np.arange(len(T)) * (interval_s / S_PER_NS)).astype(np.int64)
     spline, report = fit_spline(times, T, knot_s=interval_s)
     logger.debug(
         "waypoints met within %.2g m, %.2g rad", report.position_max_m, report.rotation_max_rad
@@ -383,7 +382,7 @@ def car_loop(
     R = so3_exp(np.stack([0 * yaw, 0 * yaw, yaw + sway[:, 2]], 1)) @ so3_exp(
         np.stack([sway[:, 0], sway[:, 1], 0 * yaw], 1)
     )
-    times = start_ns + np.round(t / _S_PER_NS).astype(np.int64)
+    times = start_ns + np.round(t / S_PER_NS).astype(np.int64)
     return fit_spline(times, se3_from_parts(R, p), knot_s=0.2)[0]
 
 
@@ -462,7 +461,7 @@ def hand_held(
     R = so3_exp(np.stack([zero, zero, yaw + shake[:, 2]], 1)) @ so3_exp(
         np.stack([shake[:, 0], shake[:, 1], zero], 1)
     )
-    times = start_ns + np.round(t / _S_PER_NS).astype(np.int64)
+    times = start_ns + np.round(t / S_PER_NS).astype(np.int64)
     return fit_spline(times, se3_from_parts(R, p + shake[:, 3:]), knot_s=0.1)[0]
 
 
@@ -490,7 +489,7 @@ def recorded_motion(path: Path) -> tuple[MotionSpline, FitReport]:
             f"{path}: describes {len(truth)} poses of {truth.body}; give two or more of the IMU"
         )
     times = truth.times_ns
-    gap_s = float(np.diff(times).max()) * _S_PER_NS
+    gap_s = float(np.diff(times).max()) * S_PER_NS
     if gap_s > 0.5:
         logger.warning("%s has a gap of %.2f s; the motion is interpolated there", path, gap_s)
     spline, report = fit_spline(times, truth.T_world_body, robust=True)

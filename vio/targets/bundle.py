@@ -19,6 +19,7 @@ import numpy.typing as npt
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, project_point, uv_D_camera, uv_D_point
 from vio.geometry.lie import FloatArray, se3_exp, so3_hat
+from vio.numerics.least_squares import Damping
 from vio.numerics.robust import median
 from vio.targets.views import Sightings
 
@@ -34,6 +35,7 @@ class _Iterations(NamedTuple):
 
     max_steps: int = 60
     converged_share: float = 1e-6  # relative change of the cost
+    first_damping: float = 1e-4
     max_damping: float = 1e8
 
 
@@ -185,25 +187,35 @@ class BoardAdjustment:
         return np.asarray(A), np.asarray(-np.linalg.solve(A, B))
 
     def _descend(self, at: RigFit, steps: int, *, cut: bool) -> RigFit:
-        damping = 1e-4
+        damping = Damping(_ITERATIONS.first_damping, _ITERATIONS.max_damping)
         for _ in range(steps):
             r = self._residuals(at)
             weight = self._weights(r, cut=cut)
             before = self._cost(r, weight, at)
-            system = self._normal(at, weight)
-            while True:
-                new = self._moved(at, *_solved(system, damping, fixed=self._fixed))
-                after = np.inf if new is None else self._cost(self._residuals(new), weight, new)
-                if new is not None and after <= before:
-                    break
-                damping *= 10
-                if damping > _ITERATIONS.max_damping:
-                    return at
-            at = new
-            damping = max(damping / 10, 1e-9)
+            new = self._step(at, weight, before, damping)
+            if new is None:
+                return at
+            at, after = new
             if before - after < _ITERATIONS.converged_share * before:
                 return at
         return at
+
+    def _step(
+        self, at: RigFit, weight: FloatArray, before: float, damping: Damping
+    ) -> tuple[RigFit, float] | None:
+        """Return a fit that costs no more, and its cost; None: no step leads to one."""
+        system = self._normal(at, weight)
+
+        def moved(value: float) -> RigFit | None:
+            return self._moved(at, *_solved(system, value, fixed=self._fixed))
+
+        def cost(new: RigFit | None) -> float:
+            return np.inf if new is None else self._cost(self._residuals(new), weight, new)
+
+        found = damping.step(moved, cost, before)
+        if found is None or found[0] is None:
+            return None
+        return found[0], found[1]
 
     def _points_cam0(self, at: RigFit) -> FloatArray:
         """Corners (R, 3) of the rows in the first camera."""

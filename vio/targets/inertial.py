@@ -10,6 +10,7 @@ systems (2013), for the problem; `vio.imu.preintegration` for the IMU's terms.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from vio.filters.imu_terms import CHOSEN, IMU_TERMS, ImuTerms, calibrated, term_
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
 from vio.imu.settings import DEFAULT_IMU
+from vio.numerics.least_squares import Damping
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
 from vio.targets.imu_checks import check_imu
@@ -42,6 +44,7 @@ class _Iterations(NamedTuple):
     numeric_step: float = 1e-6
     term_step: float = 1e-4
     gauge_weight: float = 1e-9
+    first_damping: float = 1e-4
     max_damping: float = 1e6
 
 
@@ -240,27 +243,30 @@ class _Problem:
         return np.stack([np.interp(seconds, t, values[:, k]) for k in range(3)], axis=1)
 
     def solve(self, at: _States) -> _States:
-        """Return the optimum, by Gauss-Newton with Levenberg's damping."""
-        damping = 1e-4
+        """Return the optimum, by Levenberg-Marquardt."""
+        damping = Damping(_ITERATIONS.first_damping, _ITERATIONS.max_damping)
         before = np.inf
         for _ in range(_ITERATIONS.max_steps):
             steps = self._motions(at)
             weight = self._weights(at)
             H, g, cost = self._system(at, steps, weight)
-            new = (at, 0.0)
-            while damping < _ITERATIONS.max_damping:
-                x = splu(csc_matrix(H + damping * _diagonal(H))).solve(g)
-                new = self._moved(at, x)
-                if self._cost(new, steps, weight) <= cost:
-                    break
-                new = (at, 0.0)
-                damping *= 10
-            damping = max(damping / 10, 1e-9)
-            at = self._with_offset_applied(new)
+            new = damping.step(
+                partial(self._after_step, at, H, g),
+                partial(self._cost, steps=steps, w=weight),
+                cost,
+            )
+            if new is None:
+                return at
+            at = self._with_offset_applied(new[0])
             if abs(before - cost) < _ITERATIONS.converged_share * cost:
                 return at
             before = cost
         return at
+
+    def _after_step(
+        self, at: _States, H: csc_matrix, g: FloatArray, damping: float
+    ) -> tuple[_States, float]:
+        return self._moved(at, splu(csc_matrix(H + damping * _diagonal(H))).solve(g))
 
     def _preintegrated(self, at: _States) -> Preintegrated:
         seconds = self._seconds + at.offset_s

@@ -26,7 +26,7 @@ from vio.datasets.bags.topics import (
     Roles,
 )
 from vio.datasets.images import UnreadableImageError
-from vio.datasets.levels import Band, is_mosaic
+from vio.datasets.levels import LEVEL_IMAGES, Band, is_mosaic
 from vio.datasets.rigs.camera_info import CameraInfo, region_of
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
@@ -40,8 +40,8 @@ __all__ = ["BagIndex", "Stamps", "camera_info_of", "index_bag", "info_topic", "s
 class _GapRules(NamedTuple):
     """When an accelerometer's readings have a gap."""
 
-    # An accelerometer's readings further apart than so many usual intervals, and so much time, are a
-    # gap, over which its readings are not interpolated.
+    # An accelerometer's readings further apart than so many usual intervals, and so much time, are
+    # a gap, over which its readings are not interpolated.
     usual_intervals: float = 8.0
     min_ns: int = 100_000_000
 
@@ -65,7 +65,6 @@ _SDK_MODELS = {
     "kannala brandt4": "equidistant",
 }
 _MOVING = "/tf, "  # how the moving frames are named among the streams
-_LEVEL_SAMPLES = 8  # images looked at for black and white, spread over the recording
 
 
 _Taker: TypeAlias = Callable[[Any, Message], None]  # of the fields of a message
@@ -370,7 +369,7 @@ def _image(bag: Bag, stamps: Stamps, topic: Topic, fields: Any, message: Message
         stamps.size = stamps.size or (int(fields.width), int(fields.height))
         if len(stamps.times_ns) == 1 and name in ("mono8", "mono16", "8UC1", "16UC1"):
             stamps.mosaic = _looks_like_mosaic(fields, where)
-    if (len(stamps.times_ns) - 1) % max(topic.count // _LEVEL_SAMPLES, 1) == 0:
+    if (len(stamps.times_ns) - 1) % max(topic.count // LEVEL_IMAGES, 1) == 0:
         band = band_of_message(fields, where, compressed=compressed)
         stamps.bands += [] if band is None else [band]
 

@@ -1,0 +1,46 @@
+"""The damping of nonlinear least squares by Levenberg and Marquardt, for any state and any way to
+solve for a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from vio.dataclass import dataclass
+
+State = TypeVar("State")
+_LARGER = 10.0  # after a step that raises the cost, and smaller by as much after one that does not
+
+
+@dataclass(slots=True)
+class Damping:
+    """How much of the diagonal of the normal equations is added to them.
+
+    Reference: Marquardt, An algorithm for least-squares estimation of nonlinear parameters, SIAM
+    Journal (1963).
+    """
+
+    value: float  # for the next step
+    largest: float  # beyond it no step is shorter: rounding is all that is left
+    smallest: float = 1e-9
+
+    def step(
+        self, moved: Callable[[float], State], cost: Callable[[State], float], before: float
+    ) -> tuple[State, float] | None:
+        """Return a state whose cost is no larger, and that cost; None: no step leads to one.
+
+        Args:
+            moved: the state after the step that a damping gives.
+            cost: of a state; infinite where it has none.
+            before: cost of the present state, finite.
+        """
+        while True:
+            state = moved(self.value)
+            after = cost(state)
+            if after <= before:
+                self.value = max(self.value / _LARGER, self.smallest)
+                return state, after
+            self.value *= _LARGER
+            if self.value > self.largest:
+                return None
