@@ -95,6 +95,21 @@ def test_what_a_drive_with_a_wrong_calibration_shows_is_no_shaking() -> None:
     assert shakes == [False, True]
 
 
+def test_errors_that_change_slowly_are_no_shaking() -> None:
+    """So where a rig turns whose calibration is off: Karlsruhe 0019, frames 54 to 75, half size."""
+    common_px = [0.08, 0.09, 0.08, 0.13, 0.42, 0.67, 0.66, 0.78, -0.28, -0.1, -0.02, 0.68, 0.84]
+    common_px += [0.92, 0.95, 0.93, 0.47, 0.61, 0.53]
+    shake = PairShake(322.0)
+    for k, off in enumerate(common_px):
+        shake.frame(k, off, 100)
+    assert not shake.take_findings()
+    # the same errors in another order
+    shake = PairShake(322.0)
+    for k, off in enumerate(np.random.default_rng(0).permutation(common_px)):
+        shake.frame(k, float(off * (-1) ** k), 100)
+    assert shake.take_findings()
+
+
 def test_the_factor_is_that_of_an_error_that_all_share() -> None:
     shake = PairShake(300.0)
     rng = np.random.default_rng(1)
