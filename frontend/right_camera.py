@@ -25,13 +25,16 @@ class _ContradictionRules(NamedTuple):
     # share of confirmed points below which the images contradict each other; usual is 0.8 to 1
     contradicting_share: float = 0.3
     agreeing_share: float = 0.6  # share above which they agree again
-    frames: int = 3  # in a row before it is reported, or before images that agree are used again
+    # in a row before it is reported, or before images that agree are used again; that agreed, before
+    # which it is one from the start: nothing has shown lengths yet
+    frames: int = 3
     # after as many without points to test by, the right image is tried again
     blind_frames: int = 40
 
 
 _CONTRADICTION = _ContradictionRules()
 _CODE = "right-contradicts-left"
+_UNKNOWN_CODE = "right-matches-missing"
 
 
 class RightCamera(Finder):
@@ -46,6 +49,8 @@ class RightCamera(Finder):
         self._agreeing = 0
         self._untested = 0
         self._reported = False
+        self._agreed = 0  # frames so far
+        self._unknown = False  # it is reported that nothing has shown lengths yet
 
     @property
     def contradicts(self) -> bool:
@@ -76,6 +81,7 @@ class RightCamera(Finder):
         What is not yet reported is not.
         """
         self._found = []
+        self._unknown = False
         self._reset()
 
     def _reset(self) -> None:
@@ -125,6 +131,8 @@ class RightCamera(Finder):
             self._count_agreement(index, tested=tested, agrees=agrees)
         elif tested and share < _CONTRADICTION.contradicting_share:
             self._begin(index)
+        else:
+            self._agreed += tested and share >= _CONTRADICTION.agreeing_share
         return not self._contradicts
 
     def _count_agreement(self, index: int, *, tested: bool, agrees: bool) -> None:
@@ -167,8 +175,18 @@ class RightCamera(Finder):
             "with the left images"
         )
         self._found.append(Finding(_CODE, message, index, self._since, lasts=True))
+        if self._agreed < _CONTRADICTION.frames:
+            self._unknown = True
+            message = (
+                f"frame {index}: the right images have contradicted the left ones almost from the "
+                "start, so lengths are unknown; the right camera may be turned (vio inspect)"
+            )
+            self._found.append(Finding(_UNKNOWN_CODE, message, index, 0, lasts=True))
 
     def _end(self, message: str, index: int) -> None:
         if self._reported:
             self._found.append(Finding(_CODE, message, index, ended=True))
+        if self._unknown:
+            self._unknown = False
+            self._found.append(Finding(_UNKNOWN_CODE, message, index, ended=True))
         self._reset()

@@ -184,7 +184,12 @@ class PairShake(Finder):
         """Size of the common errors, by their median: other events, as a car that passes, may be
         in almost half of the frames. A frame's error is the difference of two: its depths are those
         of the frame before.
+
+        Errors of a pair that shakes are independent. Those of a calibration that is off change slowly
+        as the rig turns: their size is that of the changes, where it is less.
         """
         if len(self._common_px) < _SHAKE.min_frames:
             return 0.0
-        return robust_sigma(self._common_px) / float(np.sqrt(2.0))
+        changes = np.diff(self._common_px)  # e - 2 e' + e'': six variances
+        sigmas = np.array([robust_sigma(self._common_px), robust_sigma(changes)])
+        return float((sigmas / np.sqrt([2.0, 6.0])).min())

@@ -126,7 +126,7 @@ CODES: dict[str, Code] = {
     ),
     "right-matches-missing": Code(
         "unusable",
-        "hardly any feature has had a right match yet, so lengths are unknown",
+        "right matches have not agreed with the left images yet, so lengths are unknown",
         "vio inspect says whether right images are turned, exchanged or not of this calibration",
     ),
     "right-camera-turned": Code(
