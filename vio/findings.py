@@ -214,8 +214,7 @@ CODES: dict[str, Code] = {
     ),
     "calibration-misread": Code(
         "unusable",
-        "rows of left and right agree by another reading of the calibration or the images, and do "
-        "not as it was read",
+        "rows agree only by another reading of the calibration or the images",
         "correct what the message names",
     ),
     "scale-off": Code(

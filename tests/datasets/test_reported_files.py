@@ -5,6 +5,7 @@ cause.
 from __future__ import annotations
 
 import re
+import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -378,6 +379,13 @@ def test_files_of_other_forms_are_named_with_what_to_do(
     (tmp_path / name).write_bytes(b"something")
     with pytest.raises(DataError, match=re.escape(said)):
         open_dataset(tmp_path)
+
+
+def test_a_zipped_recording_is_named(tmp_path: Path) -> None:
+    make_plain(tmp_path / "made")
+    archive = shutil.make_archive(str(tmp_path / "recording"), "zip", tmp_path / "made")
+    with pytest.raises(DataError, match=re.escape("recording.zip: is an archive; unpack it")):
+        open_dataset(archive)
 
 
 def test_a_camchain_whose_cameras_are_counted_from_one_says_so(tmp_path: Path) -> None:

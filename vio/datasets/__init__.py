@@ -151,7 +151,11 @@ def _parse(source: str) -> tuple[str | None, Path]:
 
 def _detect(path: Path) -> str:
     """Detect the kind of a recording from its content."""
-    kind = _folder_kind(path) if path.is_dir() else _file_kind(path)
+    from vio.datasets.unused import ARCHIVES
+
+    # a zip file's beginning is that of NumPy's archives, too
+    packed = path.is_file() and path.suffix.lower() in ARCHIVES
+    kind = None if packed else _folder_kind(path) if path.is_dir() else _file_kind(path)
     if kind is None:
         raise DataError(_unknown(path))
     return kind

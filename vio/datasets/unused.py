@@ -106,7 +106,7 @@ def _belongs(other: Path, calibration: Path) -> bool:
     )
 
 
-_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".xz", ".bz2", ".zst", ".zstd")
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".xz", ".bz2", ".zst", ".zstd")
 _OTHER_IMAGES = (".jp2", ".j2k", ".gif", ".heic", ".avif", ".jxl", ".exr", ".dng", ".raw", ".npy")
 
 
@@ -115,7 +115,7 @@ def unread_files(path: Path) -> str | None:
     the folders in it hold; None: there are none.
     """
     files = [path] if path.is_file() else [*path.glob("*.*"), *path.glob("*/*.*")]
-    archive = next((file for file in files if file.suffix.lower() in _ARCHIVES), None)
+    archive = next((file for file in files if file.suffix.lower() in ARCHIVES), None)
     if archive is not None:
         inside = Path(archive.stem).suffix.lower() in (".db3", ".mcap", ".bag")
         folder = (
