@@ -16,7 +16,7 @@ from vio.geometry.lie import (
     so3_exp,
     transform_points,
 )
-from vio.records import BoolArray, ImuRecord, IntArray
+from vio.records import BoolArray, Image, ImuRecord, IntArray
 from vio.targets.corners import Corners
 from vio.targets.description import Target
 from vio.targets.rendering import BoardRenderer, Exposure, board_points
@@ -75,6 +75,18 @@ def made_views(
         if min(len(one) for one in found) >= 20:
             views.append(View(len(views) * 100_000_000, tuple(found)))
     return views
+
+
+def render_twice(target: Target, camera: CameraModel, distance_m: float) -> Image:
+    """An image that shows the board twice, side by side."""
+    renderer = BoardRenderer(target, camera)
+    width, height = target.extent_m
+    middle = camera.width // 2
+    parts = []
+    for x, part in ((-1.1 * width, slice(None, middle)), (0.1 * width, slice(middle, None))):
+        T = se3_from_parts(so3_exp([0.1, -0.1, 0.05]), [x, -0.5 * height, distance_m])
+        parts.append(renderer.render(T, Exposure(0.6, 2.0))[:, part])
+    return np.hstack(parts)
 
 
 def poses_around(

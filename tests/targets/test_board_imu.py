@@ -16,6 +16,7 @@ from tests.calibration.test_camera_imu import (
     hand_imu,
     hand_pose,
 )
+from vio.errors import DataError
 from vio.filters.imu_terms import CHOSEN, ImuTerms, term_sigmas
 from vio.geometry.distortion import project_point
 from vio.geometry.lie import (
@@ -86,6 +87,7 @@ def _check(seeds: range, seconds: float, low: float, high: float) -> None:
         assert np.degrees(np.linalg.norm(error[3:6])) < 0.02
         assert abs(error[6]) < 5e-5
         assert found.weak == ()
+        assert 0.7 < found.chi < 1.25
         assert found.board_scale == pytest.approx(1, abs=5 * found.board_scale_sigma)
         nees.append(float(error @ np.linalg.solve(found.covariance, error)))
     # Bounds of chi-square with 7 degrees of freedom a seed.
@@ -135,6 +137,33 @@ def test_names_a_board_of_another_size(size: float, words: str) -> None:
     finding = next(text for text in found.weak if "by the IMU the board is" in text)
     assert words in finding
     assert "--size" in finding
+    assert "\n" not in finding
+
+
+@pytest.mark.parametrize(("rate", "words"), [(1.0005, "slower"), (0.9995, "faster")])
+def test_names_clocks_that_drift_against_each_other(rate: float, words: str) -> None:
+    record = hand_imu(2, 15.0, np.zeros(15))
+    stretched = replace(record, times_ns=np.rint(rate * record.times_ns).astype(np.int64))
+    found = calibrate_imu(_poses(2, 15.0), stretched, DENSITIES)
+    finding = next(text for text in found.weak if "ppm" in text)
+    assert f"ppm {words} than the IMU's" in finding
+    assert float(finding.split()[4]) == pytest.approx(500, rel=0.1)
+    assert "\n" not in finding
+
+
+def test_refuses_an_imu_with_a_dead_axis() -> None:
+    record = hand_imu(2, 15.0, np.zeros(15))
+    dead = replace(record, gyro=record.gyro * [1, 1, 0])
+    with pytest.raises(DataError, match=r"an axis may be dead|the gyro may be dead") as caught:
+        calibrate_imu(_poses(2, 15.0), dead, DENSITIES)
+    assert "\n" not in str(caught.value)
+
+
+def test_names_an_imu_whose_noise_is_larger_than_stated() -> None:
+    densities = replace(DENSITIES, gyro=0.1 * DENSITIES.gyro, accel=0.1 * DENSITIES.accel)
+    found = calibrate_imu(_poses(1, 15.0), hand_imu(1, 15.0, np.zeros(15)), densities)
+    finding = next(text for text in found.weak if "camera and IMU differ" in text)
+    assert "--imu-noise" in finding
     assert "\n" not in finding
 
 

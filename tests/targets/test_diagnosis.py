@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.board_views import SMALL, SMALL_LEFT, made_views, render_pairs
+from tests.board_views import SMALL, SMALL_LEFT, made_views, render_pairs, render_twice
 from vio.cli import main
 from vio.datasets.images import load_gray, write_png
 from vio.errors import DataError
@@ -81,6 +81,14 @@ def test_names_mirrored_images(target: Target, images: dict[str, Image]) -> None
     reason = diagnose([mirrored], target)
     assert reason is not None
     assert "mirrored" in reason
+
+
+@pytest.mark.parametrize("target", [SMALL, CHARUCO, CHECKERBOARD], ids=lambda target: target.kind)
+def test_names_a_board_that_is_shown_twice(target: Target) -> None:
+    camera = replace(SMALL_LEFT, width=752, cu=374.0)
+    reason = diagnose([render_twice(target, camera, 0.5)], target)
+    assert reason is not None
+    assert "the images show the board twice" in reason
 
 
 @pytest.mark.parametrize("target", [SMALL, CHARUCO, CHECKERBOARD], ids=lambda target: target.kind)

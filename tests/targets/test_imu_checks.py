@@ -65,6 +65,15 @@ def test_names_a_wrong_imu_in_one_line(name: str) -> None:
     assert "T_cam0_imu" not in str(caught.value)  # none is given
 
 
+@pytest.mark.parametrize("seed", [4, 6])
+def test_takes_no_chance_for_axes_or_units_where_clocks_are_too_far_apart(seed: int) -> None:
+    """Some offset of hundreds explains most of a rotation, by a reflection or a factor."""
+    poses, imu = _record(seed)
+    late = replace(imu, times_ns=imu.times_ns + 8 * 10**9)
+    with pytest.raises(DataError, match="the clocks may be further apart"):
+        calibrate_imu(poses, late, DENSITIES)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_says_nothing_of_a_right_imu(seed: int) -> None:
     poses, imu = _record(seed)

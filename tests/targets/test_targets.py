@@ -20,6 +20,7 @@ from tests.board_views import (
     T_RIGHT_LEFT,
     Flaws,
     made_views,
+    render_twice,
 )
 from vio import load_rig
 from vio.cli import main
@@ -424,8 +425,11 @@ def test_names_pairs_that_are_not_of_one_moment() -> None:
     good = calibrate_cameras(_filmed(made_views(2, 12)), GRID, "radtan")
     assert good.verdict.findings == ()
     assert good.verdict.inflation == 1
-    late = calibrate_cameras(_filmed(made_views(2, 12, Flaws(moved_m=0.002))), GRID, "radtan")
+    filmed = _filmed(made_views(2, 12, Flaws(moved_m=0.002)))
+    twice = render_twice(GRID, LEFT, 1.3)
+    late = calibrate_cameras(replace(filmed, samples=((twice, twice),)), GRID, "radtan")
     assert any("not exposed at the same moment" in finding for finding in late.verdict.findings)
+    assert "the images show the board twice" in late.verdict.findings[0]
 
 
 def test_refuses_images_of_other_moments() -> None:
@@ -551,6 +555,16 @@ def test_another_board_is_refused_in_one_line(
     assert "the images show an AprilGrid with tags 0 to 11" in message
     assert "give the file of the board that was recorded" in message
     assert message.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("side_m", "paper"), [("0.022", "A4"), ("0.03", "A3"), ("0.2", "paper larger than A0")]
+)
+def test_names_the_paper_that_holds_a_board(
+    side_m: str, paper: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["target", str(tmp_path / "board.svg"), "--size", side_m]) == 0
+    assert f"print on {paper} without scaling" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("suffix", ["svg", "pdf"])

@@ -167,8 +167,7 @@ def _imu_facts(found: CameraImu) -> dict[str, Any]:
         "gyro_bias": found.gyro_bias.tolist(),
         "accel_bias": found.accel_bias.tolist(),
         "up_board": found.up_board.tolist(),
-        "camera_chi": found.camera_chi,
-        "imu_chi": found.imu_chi,
+        "chi": found.chi,
         "views": found.views,
         "weak": list(found.weak),
         "board_scale": found.board_scale,
@@ -199,8 +198,8 @@ def _imu_rows(found: CameraImu) -> list[tuple[str, str]]:
         ),
         (
             "IMU fit",
-            f"{found.views} views; squared errors of poses {found.camera_chi:.2f}, of the IMU "
-            f"{found.imu_chi:.2f} times those expected",
+            f"{found.views} views; squared errors of poses and IMU are {found.chi:.2f} times those "
+            "expected",
         ),
         (
             "board by the IMU",
@@ -258,6 +257,7 @@ def _facts(found: CameraCalibration) -> dict[str, Any]:
             "coefficients": list(camera.coefficients),
             "sigmas": sigma[lens].tolist(),
             "residual_px": float(found.found.sigma_px[c]),
+            "residual_of_images_px": list(_residual_of_images(found, c)),
             "residual_alone_px": found.alone_sigma_px[c],
             "halves_rms_px": found.verdict.halves.rms_px[c],
             "halves_max_px": found.verdict.halves.max_px[c],
@@ -285,6 +285,18 @@ def _facts(found: CameraCalibration) -> dict[str, Any]:
             "depth_halves_at_5m": found.verdict.halves.depth_m,
         }
     return facts
+
+
+def _residual_of_images(found: CameraCalibration, camera: int) -> tuple[float, float]:
+    """Standard deviations of a coordinate in a camera's images, which nine of ten images exceed,
+    and which one of ten exceeds, pixels.
+    """
+    import numpy as np
+
+    rows = found.seen.camera == camera
+    _, first = np.unique(found.seen.view[rows], return_index=True)
+    low, high = np.percentile(found.found.corner_sigma_px[rows][first], [10, 90]).tolist()
+    return low, high
 
 
 def _rows(found: CameraCalibration) -> list[tuple[str, str]]:
@@ -316,13 +328,15 @@ def _rows(found: CameraCalibration) -> list[tuple[str, str]]:
             strict=False,
         )
         text = ", ".join(f"{key} {value:.2f} ± {s:.2f}" for key, value, s in values)
-        rows.append((name, f"{text}; residual {found.found.sigma_px[c]:.3f} px"))
-        worst = verdict.inflation * float(np.nanmax(verdict.projection_sigma_px[c]))
+        best, worst = _residual_of_images(found, c)
+        residual = f"residual {found.found.sigma_px[c]:.3f} px, in images {best:.3f} to {worst:.3f}"
+        rows.append((name, f"{text}; {residual}"))
+        off_px = verdict.inflation * float(np.nanmax(verdict.projection_sigma_px[c]))
         halves = verdict.halves
         rows.append(
             (
                 "",
-                f"projection ± {worst:.2f} px at worst; halves {halves.rms_px[c]:.2f} px apart "
+                f"projection ± {off_px:.2f} px at worst; halves {halves.rms_px[c]:.2f} px apart "
                 f"(rms), {halves.max_px[c]:.2f} at worst",
             )
         )

@@ -18,6 +18,15 @@ _DEFAULTS = {
 }
 
 
+_PAPERS_MM = {
+    "A4": (210, 297),
+    "A3": (297, 420),
+    "A2": (420, 594),
+    "A1": (594, 841),
+    "A0": (841, 1189),
+}
+
+
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "target",
@@ -44,6 +53,15 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
+def _paper(width_mm: float, height_mm: float) -> str | None:
+    """Return the smallest paper that holds a page; None: none does."""
+    least, most = sorted((width_mm, height_mm))
+    for name, (short, long) in _PAPERS_MM.items():
+        if least <= short and most <= long:
+            return name
+    return None
+
+
 def execute(args: argparse.Namespace) -> int:
     from vio.files.atomic import atomic_write_text, check_writable
     from vio.targets.description import APRILTAG, Target, target_text
@@ -63,6 +81,7 @@ def execute(args: argparse.Namespace) -> int:
     )
     page = page_of(target)
     write_page(target, args.out)
+    paper = _paper(page.width, page.height)
     sheet = args.out.with_suffix(".yaml")
     atomic_write_text(sheet, target_text(target))
     facts = {
@@ -71,10 +90,12 @@ def execute(args: argparse.Namespace) -> int:
         "description": str(sheet),
         "width_mm": page.width,
         "height_mm": page.height,
+        "paper": paper,
     }
+    size = f"{page.width:.0f} x {page.height:.0f} mm"
     rows_out = [
         ("target", str(target)),
-        ("page", f"{args.out}, {page.width:.0f} x {page.height:.0f} mm: print without scaling"),
+        ("page", f"{args.out}, {size}: print on {paper or 'paper larger than A0'} without scaling"),
         ("measure", f"the printed side, and write it into {sheet}"),
         ("next", f"vio calibrate-rig RECORDING --target {sheet}"),
     ]

@@ -20,7 +20,8 @@ table { border-collapse: collapse; } th, td { text-align: left; padding: 3px 18p
 thead th { border-bottom: 1px solid #c4ccd5; font-weight: 600; } tbody th { color: #5b6876; }
 td { font-variant-numeric: tabular-nums; } li { margin: 3px 0; overflow-wrap: anywhere; }
 .swatch { display: inline-block; width: 11px; height: 11px; border-radius: 2px; margin-right: 6px; }
-.scroll { overflow-x: auto; } img { max-width: 100%; } code { overflow-wrap: anywhere; }
+.scroll { overflow-x: auto; } .figure img { min-width: 900px; }
+img { max-width: 100%; } code { overflow-wrap: anywhere; }
 @media (max-width: 600px) { main { padding: 8px; } .modebar { display: none !important; } }
 """
 

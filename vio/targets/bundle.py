@@ -52,6 +52,8 @@ class _CornerWeights(NamedTuple):
     behind_px: float = 100.0  # residual of a corner that the lens cannot project
     # of the camera's usual image: how many count with those of an image for its variance
     usual_corners: float = 5.0
+    # standard deviation of an image over its camera's, beyond which its pose is called wrong
+    max_image_ratio: float = 5.0
 
 
 _WEIGHTS = _CornerWeights()
@@ -291,9 +293,10 @@ class BoardAdjustment:
         sigma = self._sigmas(r)
         if cut:
             every = np.ones(len(r), dtype=bool)
-            variance = self._by_image(self._image_medians(r), every, sigma) ** 2
-            squared = np.sum(r**2, axis=1) / variance
-            return np.asarray((squared < _WEIGHTS.cut_sigmas**2) / variance)
+            own = self._by_image(self._image_medians(r), every, sigma)
+            is_near = np.sum(r**2, axis=1) < (_WEIGHTS.cut_sigmas * own) ** 2
+            is_near &= own < _WEIGHTS.max_image_ratio * sigma[self.seen.camera]
+            return np.asarray(is_near / own**2)
         variance = sigma[self.seen.camera] ** 2
         squared = np.sum(r**2, axis=1) / variance
         return np.asarray(1 / (1 + squared / _WEIGHTS.quarter_sigmas**2) ** 2 / variance)

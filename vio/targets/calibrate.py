@@ -18,7 +18,7 @@ from vio.records import ImuDensities, IntArray
 from vio.targets.bundle import Adjusted, BoardAdjustment
 from vio.targets.corners import Corners
 from vio.targets.description import Target
-from vio.targets.diagnosis import clearly_other_board, diagnose
+from vio.targets.diagnosis import clearly_other_board, diagnose, shown_twice
 from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
 from vio.targets.lenses import LENSES, LensChoice, Rival, choose_lens, rivals_of
 from vio.targets.recording import Filmed
@@ -97,7 +97,7 @@ def calibrate_cameras(
         progress("adjust the pair")
         start = pair_start(seen, (alone[0], alone[1]))
         found = BoardAdjustment(seen).solve(start)
-        _check_pair(found)
+        _check_pair(found, filmed, target)
     progress("compare halves")
     sigmas = tuple(float(one.sigma_px[0]) for one in alone)
     verdict = judge(found, seen, sigmas)
@@ -107,6 +107,8 @@ def calibrate_cameras(
         rivals = rivals_of(choice, alone[0].at.cameras[0], left, filmed.sizes[0])
         if (doubt := lens_finding(lens, rivals, verdict)) is not None:
             verdict = replace(verdict, findings=(*verdict.findings, doubt))
+    if (twice := _shown_twice(filmed, target)) is not None:
+        verdict = replace(verdict, findings=(twice, *verdict.findings))
     rig = _rig_of(found)
     return CameraCalibration(rig, lens, choice, rivals, found, seen, sigmas, verdict)
 
@@ -215,10 +217,12 @@ def _check_views(filmed: Filmed, target: Target) -> None:
                     f"the {name} camera sees the board in all {count} frames, and {MIN_VIEWS} are "
                     "needed: record 30 s of it at several distances and tilts"
                 )
+            # A checkerboard without markers is counted from its outermost corners.
+            whole = "show all of it" if target.kind == "checkerboard" else "move it closer"
             raise DataError(
                 f"the {name} camera sees the board in {count} of {filmed.frames} frames, and "
-                f"{MIN_VIEWS} are needed; check that the target file is that of the board, move it "
-                "closer, light it well, focus, and record 30 s of it at several distances and tilts"
+                f"{MIN_VIEWS} are needed; check that the target file is that of the board, {whole}, "
+                "light it well, focus, and record 30 s of it at several distances and tilts"
             )
         places = _places(filmed, c)
         if places < MIN_VIEWS:
@@ -276,11 +280,18 @@ def _check_fit(one: Adjusted, camera: int, filmed: Filmed, target: Target) -> No
         )
 
 
-def _check_pair(found: Adjusted) -> None:
+def _shown_twice(filmed: Filmed, target: Target) -> str | None:
+    """Return whether images of any camera show two boards."""
+    return shown_twice([image for images in filmed.samples for image in images], target)
+
+
+def _check_pair(found: Adjusted, filmed: Filmed, target: Target) -> None:
     """Refuse images that are no pair, or exchanged."""
     refused = float(np.mean(~found.used))
     off_px = float(found.sigma_px.max())
     if refused > _VIEWS.max_refused_share or off_px > _VIEWS.max_residual_px:
+        if (twice := _shown_twice(filmed, target)) is not None:
+            raise DataError(twice)
         raise DataError(
             "left and right images are not of the same moments: corners fit each camera alone, and "
             f"with one pose of the right camera they are off by {off_px:.0f} px, "

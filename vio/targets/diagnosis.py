@@ -16,7 +16,7 @@ from vio.records import Image
 from vio.targets.corners import CornerDetector, subpixel
 from vio.targets.description import APRILTAG, Target, marker_dictionary
 from vio.targets.homography import homographies, mapped
-from vio.targets.seeds import MarkerReader, Read
+from vio.targets.seeds import MarkerReader, Read, checkerboard_seeds
 
 
 class _MarkerRules(NamedTuple):
@@ -68,6 +68,8 @@ def diagnose(images: Sequence[Image], target: Target) -> str | None:
     seen = sum(found)
     if (dark := _darkness(images)) is not None:
         return dark
+    if (twice := shown_twice(images, target)) is not None:
+        return twice
     if target.kind != "checkerboard":
         # In mirrored images hardly a marker is read, which leaves nothing to arrange.
         if (other := _other_arrangement(images, target)) is not None:
@@ -86,6 +88,36 @@ def diagnose(images: Sequence[Image], target: Target) -> str | None:
             )
     is_seen = 0 < len(found) <= 2 * int(np.count_nonzero(found))
     return _other_kind(images, target, is_seen=is_seen)
+
+
+def shown_twice(images: Sequence[Image], target: Target) -> str | None:
+    """Say whether an image shows two boards of the described kind."""
+    if target.kind == "checkerboard":
+        is_twice = any(_shows_two_checkerboards(image, target) for image in images)
+    else:
+        reader = MarkerReader(target)
+        is_twice = any(reader.repeated(image) >= _MARKERS.min_markers for image in images)
+    if not is_twice:
+        return None
+    return (
+        "the images show the board twice, or two boards that are alike: cover one, and record again"
+    )
+
+
+def _shows_two_checkerboards(image: Image, target: Target) -> bool:
+    """Return whether another board is found where the first one is covered."""
+    import cv2
+
+    _, uv = checkerboard_seeds(image, target)
+    if not len(uv):
+        return False
+    middle = uv.mean(axis=0)
+    # The outer squares lie beyond the outermost corners.
+    grown = 1 + 2 / (min(target.rows, target.cols) - 2)
+    hull = cv2.convexHull((middle + grown * (uv - middle)).astype(np.float32))
+    covered = image.copy()
+    cv2.fillConvexPoly(covered, np.rint(hull).astype(np.int32), float(np.median(image)))
+    return len(checkerboard_seeds(covered, target)[1]) > 0
 
 
 def _darkness(images: Sequence[Image]) -> str | None:

@@ -31,6 +31,9 @@ class _OffsetRules(NamedTuple):
     max_step_s: float = 0.5  # between views whose poses give a rate
     min_intervals: int = 20
     min_offset_s: float = 0.05  # below, the adjustment finds the clock's offset by itself
+    near_s: float = 0.15
+    # of the rotation, beyond `near_s`: of hundreds of offsets, one explains the rest by chance
+    max_far_unexplained: float = 0.05
 
 
 _OFFSET = _OffsetRules()
@@ -100,6 +103,12 @@ def _intervals(times_ns: IntArray, T_cam0_board: FloatArray) -> Intervals:
     return Intervals(times_ns[rows], times_ns[rows + 1], twists)
 
 
+def _agrees(gyro_fit: GyroFit) -> bool:
+    """Return whether some linear map takes the gyro's rates to those of the camera."""
+    is_near = abs(gyro_fit.offset_s) < _OFFSET.near_s
+    return gyro_fit.unexplained <= (AGREES if is_near else _OFFSET.max_far_unexplained)
+
+
 def _is_mirrored(gyro_fit: GyroFit, R: FloatArray) -> bool:
     """Whether the nearest orthogonal map fits and the nearest rotation (3, 3) does not."""
     fits_mirrored = gyro_fit.fits(_nearest_map(gyro_fit.S_cg))
@@ -122,11 +131,11 @@ def _evidence(record: Record, gyro_fit: GyroFit, size: Size, R: FloatArray) -> E
 
 def _judge(record: Record, gyro_fit: GyroFit, size: Size) -> list[InertialFinding]:
     """Compare the IMU with the board's poses, as `vio.monitor.inertial` compares it with tracks."""
+    if not _agrees(gyro_fit):
+        return [_STILL] if _is_still(record) else [_disagreement(gyro_fit)]
     R = nearest_rotation(gyro_fit.S_cg)
     if _is_mirrored(gyro_fit, R):
         return [_MIRRORED]
-    if gyro_fit.unexplained > AGREES:
-        return [_STILL] if _is_still(record) else [_disagreement(gyro_fit)]
     evidence = _evidence(record, gyro_fit, size, R)
     size = resolve_size(size, evidence)
     found = judge_gyro(evidence, size.unit or 1.0)

@@ -62,6 +62,8 @@ class _ViewRules(NamedTuple):
 
 
 _VIEWS = _ViewRules()
+_MAX_CHI = 4.0  # squared residuals over those expected, beyond which they are named
+_HOPELESS_DEG = 10.0  # standard deviation of a rotation that then says nothing
 _BIAS_SIGMA = np.repeat([0.1, 0.5], 3)  # at the first view, rad/s and m/s^2
 
 
@@ -84,6 +86,16 @@ class _SizeRules(NamedTuple):
 
 
 _SIZE = _SizeRules()
+
+
+class _DriftRules(NamedTuple):
+    """When the clocks drift against each other."""
+
+    min_sigmas: float = 5.0
+    min_s: float = 1e-3  # over the record
+
+
+_DRIFT = _DriftRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +128,9 @@ class CameraImu:
     accel_bias: FloatArray  # (3,) m/s^2
     up_board: FloatArray  # (3,) unit vector against gravity in the board's frame
     covariance: FloatArray  # (7, 7) of xi in `T_cam0_imu exp(xi)`, [rho; phi], and the time offset
-    camera_chi: float  # mean squared whitened residual of the poses; 1 expected
-    imu_chi: float  # likewise of the IMU's motions
+    # squared whitened residuals over degrees of freedom, or of the poses alone, where more; 1
+    # expected; more inflates the covariance
+    chi: float
     views: int
     weak: tuple[str, ...]  # what the motion hardly shows or contradicts, with what to record
     terms: FloatArray  # (15,) scale and misalignment, see `vio.records.IMU_ENTRIES`
@@ -163,7 +176,7 @@ def calibrate_imu(
 
     Raises:
         DataError: units, axes, signs or stamps of the IMU are wrong, too few views lie within its
-            record, or the motion shows no rotation.
+            record, the motion shows no rotation, or IMU and poses contradict each other.
     """
     offset_s = check_imu(poses.times_ns, poses.T_cam0_board, _rotation_sigma(poses), imu)
     apart_ns = round(NS_PER_S * offset_s)
@@ -320,11 +333,15 @@ class _Problem:
         body = replace(at.body, T_world_imu=at.body.T_world_imu @ se3_exp(late_s * twists))
         return replace(at, body=body, offset_s=at.offset_s + late_s)
 
-    def _camera(self, at: _States, late_s: float = 0.0, scale: float = 1.0) -> FloatArray:
-        """Whitened residuals (K, 6) of the board's poses, exposed late by a time, of a board that
-        is larger than its description.
+    def _camera(
+        self, at: _States, late_s: float | FloatArray = 0.0, scale: float = 1.0
+    ) -> FloatArray:
+        """Whitened residuals (K, 6) of the board's poses, exposed late by a time, or by one for
+        each view (K,), of a board that is larger than its description.
         """
-        T_world_imu = at.body.T_world_imu @ se3_exp(late_s * self._twists(at))
+        T_world_imu = at.body.T_world_imu @ se3_exp(
+            np.asarray(late_s)[..., None] * self._twists(at)
+        )
         T_world_board = se3_from_parts(at.R_world_board, np.zeros(3))
         expected = at.T_cam0_imu @ se3_inverse(T_world_imu) @ T_world_board
         measured = self.poses.T_cam0_board.copy()
@@ -332,9 +349,14 @@ class _Problem:
         r = se3_log(measured @ se3_inverse(expected))
         return np.asarray(np.einsum("kij,kj->ki", self._root, r))
 
+    def _pose_scale(self, at: _States) -> float:
+        """Factor by which the variances of the poses are larger than stated."""
+        chi = np.mean(self._camera(at) ** 2, axis=1)
+        return max(float(np.median(chi)), _VIEWS.min_mean_chi)
+
     def _weights(self, at: _States) -> FloatArray:
         chi = np.mean(self._camera(at) ** 2, axis=1)
-        scale = max(float(np.median(chi)), _VIEWS.min_mean_chi)
+        scale = self._pose_scale(at)
         return np.asarray(1 / (1 + chi / (_VIEWS.quarter_chi * scale)) / np.sqrt(scale))
 
     def _inertial(self, at: _States, motions: _Motions) -> FloatArray:
@@ -419,21 +441,32 @@ class _Problem:
         return rows.normal()
 
     def result(self, at: _States) -> CameraImu:
-        """Return the calibration with its covariance."""
+        """Return the calibration with its covariance.
+
+        Raises:
+            DataError: camera and IMU contradict each other.
+        """
         motions = self._motions(at)
         weight = self._weights(at)
         by_lens = self._root @ self.poses.xi_D_lens
-        further = np.concatenate([self._camera_by_scale(at), by_lens], axis=2)
-        H, g, _ = self._system(at, motions, weight, further)
-        inertial = float(np.mean(self._inertial(at, motions) ** 2))
-        shared = self._shared_covariance(H, self._shared, inertial)
+        extras = (self._camera_by_scale(at), self._camera_by_drift(at))
+        further = np.concatenate([*extras, by_lens], axis=2)
+        H, g, cost = self._system(at, motions, weight, further)
+        chi = cost / self._freedom()
+        worst_chi = max(chi, self._pose_scale(at))
+        shared = self._shared_covariance(H, self._shared, chi)
         P = shared[:7, :7]
+        rotation_deg = float(np.degrees(np.sqrt(np.diag(P)[3:6].max())))
+        if worst_chi > _MAX_CHI and rotation_deg > _HOPELESS_DEG:
+            raise DataError(
+                f"the IMU cannot be used: it contradicts the board's poses {np.sqrt(worst_chi):.0f} "
+                "times more than its noise explains: an axis may be dead, clipped or of another "
+                "unit than the others, or samples are missing"
+            )
         sigmas = np.zeros(IMU_TERMS)
         sigmas[self._chosen] = np.sqrt(np.diag(shared)[_SHARED:])
-        count = _STATE * len(self._seconds) + self._shared + 1
-        off = float(splu(H[:count, :count].tocsc()).solve(g[:count])[-1])
-        variance = float(self._shared_covariance(H, self._shared + 1, inertial)[-1, -1])
-        off_sigma = float(np.sqrt(variance))
+        off, off_sigma = self._extra(H, g, 0, chi)
+        drift, drift_sigma = self._extra(H, g, 1, chi)
         return CameraImu(
             at.T_cam0_imu,
             at.offset_s,
@@ -441,10 +474,14 @@ class _Problem:
             at.body.bias[0, 3:],
             at.R_world_board[2],
             P,
-            float(np.mean(self._camera(at) ** 2)),
-            inertial,
+            worst_chi,
             len(self._seconds),
-            (*_weak(np.sqrt(np.diag(P))), *_size_findings(off, off_sigma)),
+            (
+                *_disagreement_findings(worst_chi),
+                *_drift_findings(drift, drift_sigma, float(np.ptp(self._seconds))),
+                *_size_findings(off, off_sigma),
+                *_weak(np.sqrt(np.diag(P))),
+            ),
             at.terms,
             sigmas,
             1 + off,
@@ -456,25 +493,58 @@ class _Problem:
         ends = [self._camera(at, scale=1 + sign * _ITERATIONS.numeric_step) for sign in (1.0, -1.0)]
         return np.asarray((ends[0] - ends[1]) / (2 * _ITERATIONS.numeric_step))[:, :, None]
 
-    def _shared_covariance(self, H: csc_matrix, count: int, inertial: float) -> FloatArray:
+    def _camera_by_drift(self, at: _States) -> FloatArray:
+        """Derivative (K, 6, 1) of the poses' whitened residuals by the rate of one clock against
+        the other, about the middle of the record.
+        """
+        from_middle = self._seconds - self._seconds.mean()
+        ends = [self._camera(at, sign * _ITERATIONS.numeric_step * from_middle) for sign in (1, -1)]
+        return np.asarray((ends[0] - ends[1]) / (2 * _ITERATIONS.numeric_step))[:, :, None]
+
+    def _extra(self, H: csc_matrix, g: FloatArray, which: int, chi: float) -> tuple[float, float]:
+        """Return an unknown that was taken as zero, and its standard deviation, if it were free
+        alone.
+
+        Args:
+            H: normal equations, the extra unknowns and the lens last.
+            g: their right-hand side.
+            which: of the extra unknowns.
+            chi: as `_shared_covariance` takes it.
+        """
+        count = _STATE * len(self._seconds) + self._shared
+        order = np.arange(H.shape[0])
+        order[[count, count + which]] = order[[count + which, count]]
+        turned = H[order][:, order]
+        free = order[: count + 1]
+        value = float(splu(H[free][:, free].tocsc()).solve(g[free])[-1])
+        variance = self._shared_covariance(turned, self._shared + 1, chi)[-1, -1]
+        return value, float(np.sqrt(variance))
+
+    def _freedom(self) -> int:
+        """Residuals of poses, motions, bias walks and priors, less the unknowns."""
+        steps = len(self._seconds) - 1
+        residuals = 6 * len(self._seconds) + (9 + 6) * steps + 6 + len(self._chosen)
+        return residuals - _STATE * len(self._seconds) - self._shared
+
+    def _shared_covariance(self, H: csc_matrix, count: int, chi: float) -> FloatArray:
         """Covariance of the unknowns (count,) that follow the views' states.
 
         Noise of corners and IMU averages out over the views. An error of the lens does not: all
         poses have it in common, so its effect on the optimum is added.
 
         Args:
-            H: normal equations, the board's scale and the lens last.
+            H: normal equations, extra unknowns and the lens last.
             count: of the unknowns, those behind them taken as known.
-            inertial: mean squared whitened residual of the IMU, by which noise is inflated.
+            chi: squared residuals over those expected, by which noise is inflated.
         """
         first = _STATE * len(self._seconds)
         free = first + count
-        lens = first + self._shared + 1
+        lens = H.shape[0] - len(self.poses.lens_covariance)
         wanted = np.zeros((free, count))
         wanted[first + np.arange(count), np.arange(count)] = 1
         solved = splu(H[:free, :free].tocsc()).solve(wanted)
         by_lens = -solved.T @ H[:free, lens:].toarray()
-        P = max(inertial, 1.0) * solved[first:] + by_lens @ self.poses.lens_covariance @ by_lens.T
+        P = max(chi, 1.0) * solved[first:] + by_lens @ self.poses.lens_covariance @ by_lens.T
         return np.asarray(0.5 * (P + P.T))
 
 
@@ -514,6 +584,31 @@ def _weak(sigma: FloatArray) -> tuple[str, ...]:
     return tuple(out)
 
 
+def _drift_findings(drift: float, sigma: float, seconds: float) -> tuple[str, ...]:
+    """Return whether one clock is faster than the other."""
+    apart_s = abs(drift) * seconds
+    if abs(drift) < _DRIFT.min_sigmas * sigma or apart_s < _DRIFT.min_s:
+        return ()
+    word = "slower" if drift > 0 else "faster"
+    return (
+        f"the camera's clock is {1e6 * abs(drift):.0f} ± {1e6 * sigma:.0f} ppm {word} than the IMU's, "
+        f"{1e3 * apart_s:.1f} ms over the record: stamp both by one clock, and by measured times, "
+        "not by nominal rates",
+    )
+
+
+def _disagreement_findings(chi: float) -> tuple[str, ...]:
+    """Return whether camera and IMU differ by much more than their noise explains."""
+    if chi < _MAX_CHI:
+        return ()
+    return (
+        f"camera and IMU differ {np.sqrt(chi):.1f} times more than their noise explains (stated "
+        "noise too small, axes whose scale is off, vibration, rolling shutter, or unsteady "
+        "stamps), and the standard deviations may be too small: give the noise by --imu-noise, or "
+        "estimate scales by --imu-terms scale",
+    )
+
+
 def _size_findings(off: float, sigma: float) -> tuple[str, ...]:
     """Return whether the IMU sees a board of another size."""
     if abs(off) < max(_SIZE.min_sigmas * sigma, _SIZE.min_share):
@@ -521,7 +616,8 @@ def _size_findings(off: float, sigma: float) -> tuple[str, ...]:
     word = "larger" if off > 0 else "smaller"
     return (
         f"by the IMU the board is {100 * abs(off):.1f} ± {100 * sigma:.1f} % {word} than in the "
-        "target file: measure the side of a tag or square, and give it by --size",
+        "target file: measure the side of a tag or square, and give it by --size; if it is right, "
+        "the accelerometer's scale is off (--imu-terms scale)",
     )
 
 

@@ -60,7 +60,8 @@ def calibration_page(
             _picture(
                 "Uncertainty of depth",
                 "Standard deviation of a point's depth by lenses and the pair's pose alone, without "
-                "the noise of its pixels. An error of the board's measured size comes on top.",
+                "the noise of its pixels; blank where one image alone shows it. An error of the board's "
+                "measured size comes on top.",
                 depth_png(found),
             )
         )
@@ -131,7 +132,8 @@ def _section(title: str, inner: str) -> str:
 
 
 def _picture(title: str, remark: str, png: bytes) -> str:
-    return _section(title, f'<p class="remark">{text(remark)}</p>{image(png, "png", title)}')
+    figure = f'<div class="scroll figure">{image(png, "png", title)}</div>'
+    return _section(title, f'<p class="remark">{text(remark)}</p>{figure}')
 
 
 def write_page(

@@ -52,6 +52,7 @@ def views_png(found: CameraCalibration) -> bytes:
     axes[0][-1].hist(distance, bins=12)
     axes[0][-1].set_xlabel("distance, m")
     axes[0][-1].set_ylabel("views")
+    axes[0][-1].yaxis.get_major_locator().set_params(integer=True)
     axes[0][-1].set_title("distances of the board")
     return _png(figure)
 
@@ -76,7 +77,8 @@ def uncertainty_png(found: CameraCalibration) -> bytes:
             _NEAR_AND_FAR_M, middle, "o:", color=f"C{c}", label=f"{_name(found, c)}, middle"
         )
     last.set_xlabel("distance, m")
-    last.set_title("standard deviation of projection, px")
+    last.set_ylabel("standard deviation, px")
+    last.set_title("projection, over distance")
     last.grid(True, which="both", alpha=0.3)
     last.legend(fontsize=8)
     return _png(figure)
@@ -139,7 +141,7 @@ def _draw_corners(axes: Any, found: CameraCalibration, c: int) -> None:
 def _draw_uncertainty(axes: Any, found: CameraCalibration, c: int) -> None:
     sigma = found.verdict.inflation * found.verdict.projection_sigma_px[c]
     _map(axes, found.verdict.grid[c], sigma, found.found.at.cameras[c])
-    axes.set_title(f"{_name(found, c)}: standard deviation of projection, px")
+    axes.set_title(f"{_name(found, c)}: sigma of projection, px")
 
 
 def _draw_residuals(axes: Any, found: CameraCalibration, c: int) -> None:
@@ -166,7 +168,8 @@ def _draw_depth(axes: Any, found: CameraCalibration) -> None:
         sigmas.append(float(np.sqrt(np.mean(seen**2))) if len(seen) else np.nan)
     axes[1].loglog(_DISTANCES_M, verdict.inflation * np.array(sigmas), "o-")
     axes[1].set_xlabel("distance, m")
-    axes[1].set_title("standard deviation of depth, m")
+    axes[1].set_ylabel("standard deviation, m")
+    axes[1].set_title("depth, over distance")
     axes[1].grid(True, which="both", alpha=0.3)
 
 

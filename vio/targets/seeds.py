@@ -94,6 +94,13 @@ class MarkerReader:
                 break
         return found
 
+    def repeated(self, image: Image) -> int:
+        """Return how many markers are read at two places, as two boards show them."""
+        found: list[Read] = []
+        for scale, grown_px in self._looks:
+            found += self._prints.read(image, self._quads(image, scale, grown_px))
+        return len(_at_two_places(found))
+
     def _quads(self, image: Image, scale: float, grown_px: int) -> FloatArray:
         """Quadrilaterals (Q, 4, 2) that may be markers, clockwise."""
         import cv2
@@ -109,14 +116,23 @@ class MarkerReader:
 
 def _each_once(found: Sequence[Read]) -> list[Read]:
     """Return the best of each marker's readings; none where it was read at two places."""
+    elsewhere = _at_two_places(found)
     best: dict[int, Read] = {}
-    elsewhere = set[int]()
+    for one in sorted(found, key=lambda read: -read.correlation):
+        best.setdefault(one.id, one)
+    return [one for one in best.values() if one.id not in elsewhere]
+
+
+def _at_two_places(found: Sequence[Read]) -> set[int]:
+    """Return the numbers of markers that were read at two places."""
+    best: dict[int, Read] = {}
+    out = set[int]()
     for one in sorted(found, key=lambda read: -read.correlation):
         other = best.setdefault(one.id, one)
         apart = float(np.linalg.norm(other.uv.mean(axis=0) - one.uv.mean(axis=0)))
         if apart > _MARKERS.same_place_share * max(one.side_px, other.side_px):
-            elsewhere.add(one.id)
-    return [one for one in best.values() if one.id not in elsewhere]
+            out.add(one.id)
+    return out
 
 
 class _Prints:
