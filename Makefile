@@ -25,8 +25,8 @@ demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
 	@echo "the command vio: . $(BIN)/activate"
 	@test -d vio/numerics/machine_code || { \
-		echo "compiling the other loops in the background, once: about 200 s of computing (ended by: pkill -f tools.prebuild); until then runs are slower and load 130 MiB more"; \
-		nice $(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 & }
+		nice $(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 & \
+		echo "compiling the other loops in the background, once: about 200 s of computing (ended by: kill $$!); until then runs are slower and load 130 MiB more"; }
 
 # Algebra, records, settings, filters, and runs on features; under a minute on two cores once the loops are compiled.
 QUICK := geometry/test_lie geometry/test_stereo_geometry geometry/test_distortion numerics/test_statistics numerics/test_robust \
