@@ -15,15 +15,14 @@ Row: TypeAlias = dict[str, Any]
 _FAR = 10.0  # standard deviations
 _PAGE = """# Faults that are drawn
 
-`python -m tools.faults.draws` draws kind, recording, size, moment and length of a fault from a seed; the recordings are
-real ones and renders, short (2 to 11 s). Commit {commit}, seeds {seeds}.
+`python -m tools.faults.draws` draws faults of short recordings and renders (2 to 11 s) from a seed. Commit {commit},
+seeds {seeds}.
 
 *Covered*: the position, relative to the first pose, is within {covered:g} stated standard deviations (root of the
-trace) in every frame, or at most a fifth further off than in the recording as it is. *Flagged*: there is a
-[finding](findings.md) that makes estimates degraded or unusable and that the recording as it is does not have; *soon*
+trace) in every frame, or at most a fifth further off than in the recording as it is. *Flagged*: a
+[finding](findings.md) that the recording as it is does not have makes estimates degraded or unusable; *soon*
 within {soon} frames of the fault's first frame. *Silent*: neither covered
-nor flagged before the end of the run. *Refused*: the run ends with an error. Kinds marked * were kept aside while the
-checks were written.
+nor flagged. *Refused*: the run ends with an error. Kinds marked * were kept aside at first.
 
 {summary}
 
@@ -33,7 +32,7 @@ checks were written.
 
 ## Healthy variants
 
-Nothing may be said of these that is not said of the recording as it is.
+These must not be flagged.
 
 {healthy}
 """
