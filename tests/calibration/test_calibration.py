@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vio.calibration.egomotion import CameraMotion, camera_motion
+from vio.calibration.egomotion import CameraMotion, _fit_motions, camera_motion
 from vio.calibration.findings import NotObservable
 from vio.calibration.gyro import align_gyro
 from vio.calibration.inertial import ImuAlignment, rates_of
@@ -21,9 +21,10 @@ from vio.calibration.stereo import (
     row_residuals,
 )
 from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo
+from vio.cameras.projection import camera_args
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import StereoCamera, project
 from vio.records import ImuSample, feature_tracks
 from vio.sim.imu import ImuNoise, simulate_imu
 from vio.sim.motion import MotionSpline, hand_held, motion_at
@@ -171,6 +172,36 @@ def test_reports_a_wrong_stereo_calibration(
         assert "off by 1.0" in findings[0].detail or "off by 0.9" in findings[0].detail
 
 
+@pytest.mark.parametrize(
+    ("segments", "sigma_deg", "turn_deg", "is_named"),
+    [
+        (4, 0.002, 0.04, False),
+        (4, 0.002, 0.06, True),
+        (4, 0.02, 0.09, False),  # five standard deviations
+        (4, 0.02, 0.11, True),
+        (None, 0.002, 0.28, False),  # single pairs: lens models look like turns
+        (None, 0.002, 0.32, True),
+    ],
+)
+def test_turns_are_named_from_what_the_images_can_tell_on(
+    estimate: StereoEstimate,
+    matches: RayMatches,
+    segments: int | None,
+    sigma_deg: float,
+    turn_deg: float,
+    is_named: bool,
+) -> None:
+    exact = replace(
+        estimate,
+        R_cam1_cam0=T_CAM0_CAM1[:3, :3].T,
+        direction=_direction(T_CAM0_CAM1),
+        rotation_sigma_deg=sigma_deg,
+        segments=segments,
+    )
+    found = judge_stereo(exact, _changed((turn_deg, 0.0, 0.0)), matches)
+    assert [f.fault for f in found] == ["left-right rotation wrong"] * is_named
+
+
 def test_reports_exchanged_images(matches: RayMatches) -> None:
     swapped = RayMatches(matches.pair, matches.ray1, matches.ray0)
     inverse = se3_inverse(T_CAM0_CAM1)
@@ -274,6 +305,33 @@ def test_reports_a_wrong_imu_calibration(
         (se3_from_parts(R, t + np.array([0, 0.2, 0.3])), "IMU-camera translation wrong"),
     ):
         assert [f.fault for f in judge_imu(found, lever_arm, given)] == [fault]
+
+
+@pytest.mark.parametrize(("noise_radps", "is_weak"), [(0.165, False), (0.19, True)])
+def test_a_time_offset_known_to_five_milliseconds_is_enough(
+    spline: MotionSpline, samples: tuple[ImuSample, ...], noise_radps: float, is_weak: bool
+) -> None:
+    motion = _seen(spline)
+    noise = np.random.default_rng(5).normal(0.0, noise_radps, (len(motion.twists), 3))
+    twists = motion.twists + np.hstack([np.zeros_like(noise), noise])
+    found = align_gyro(replace(motion, twists=twists), rates_of(samples))
+    assert found.time_offset_sigma_s == pytest.approx(0.005, rel=0.15)  # control
+    assert ("time offset" in found.weak) == is_weak
+
+
+@pytest.mark.parametrize(("depth_m", "is_determined"), [(4300.0, True), (4900.0, False)])
+def test_points_that_are_kilometres_away_determine_no_translation(
+    depth_m: float, is_determined: bool
+) -> None:
+    camera = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
+    rays = np.column_stack([np.random.default_rng(0).uniform(-1.0, 1.0, (60, 2)), np.ones(60)])
+    points = depth_m * rays
+    T = np.eye(4)[None]
+    determined = np.zeros(1, dtype=np.bool_)
+    _fit_motions(
+        camera_args(camera), points, project(camera, points), np.array([0, 60]), T, determined
+    )
+    assert determined.tolist() == [is_determined]
 
 
 def test_alignment_is_unobservable_without_rotation(

@@ -107,7 +107,7 @@ def test_left_only_features_have_no_right_pixel(tmp_path: Path) -> None:
 
 
 # --- extrinsics
-# ---------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_corrects_mixed_extrinsics_and_adds_a_note(long_drive: Drive, tmp_path: Path) -> None:
@@ -252,7 +252,7 @@ def test_distinguishes_motion_from_noise() -> None:
 
 
 # --- bad input
-# ----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def _swap_cameras(arrays: Arrays) -> Arrays:
@@ -350,6 +350,20 @@ def test_newer_calibration_must_be_a_rectified_pair(
     path = make_npz(tmp_path / "bad.npz", {**ece276a_new_arrays(make_drive(6)), key: value})
     with pytest.raises(CalibrationError, match=message):
         read_ece276a(path, DEFAULT)
+
+
+@pytest.mark.parametrize(("aside", "is_pair"), [(0.018, True), (0.022, False)])
+def test_a_pair_may_be_a_little_off_its_row(aside: float, is_pair: bool, tmp_path: Path) -> None:
+    """By two hundredths of the baseline, as the published files are rounded."""
+    arrays = ece276a_new_arrays(make_drive(6))
+    T_cam1_cam0 = se3_from_parts(np.eye(3), [-0.5, 0.0, 0.5 * aside])
+    arrays["extR_T_imu"] = T_cam1_cam0 @ arrays["extL_T_imu"]
+    path = make_npz(tmp_path / "a.npz", arrays)
+    if is_pair:
+        assert read_ece276a(path, DEFAULT).recording.camera.baseline_m == pytest.approx(0.5)
+    else:
+        with pytest.raises(CalibrationError, match="place the cameras"):
+            read_ece276a(path, DEFAULT)
 
 
 # --- the published files

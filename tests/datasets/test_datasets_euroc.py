@@ -33,10 +33,11 @@ from tests.euroc_maker import (
 )
 from tests.same_events import frames_of
 from tests.sift import match_sift
-from vio.cameras.rig import rectifier_of
+from vio.cameras.rig import Rig, rectifier_of
 from vio.cli.running import RunOptions, process
 from vio.config import load_config
 from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.companions import imu_on_camera_clock
 from vio.datasets.euroc import read_euroc
 from vio.datasets.euroc_files import camera_yaml, read_camera_yaml, rig_read_as
 from vio.datasets.frame_times import pair_stamps
@@ -47,7 +48,7 @@ from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import rectified_cameras, rectifying_rotations
 from vio.geometry.stereo import StereoCamera
-from vio.records import ImuDensities, ImuSample, Recording, StereoFrame
+from vio.records import ImuDensities, ImuRecord, ImuSample, Recording, StereoFrame
 from vio.sim.rigs import euroc_like_rig
 
 
@@ -685,3 +686,17 @@ def test_poses_that_no_inverse_gives_are_read_to_their_last_place() -> None:
         np.testing.assert_array_equal(again.T_rect0_imu[:3, :3], T[:3, :3])
         np.testing.assert_allclose(again.T_rect0_imu, T, rtol=0, atol=4e-16)
         assert again.camera.baseline_m == pytest.approx(camera.baseline_m, abs=4e-16)
+
+
+@pytest.mark.parametrize(("offset_s", "is_named"), [(0.9, False), (1.1, True), (-1.1, True)])
+def test_a_long_shift_of_the_calibration_is_named_where_no_sample_fits(
+    offset_s: float, is_named: bool
+) -> None:
+    """A time shift in milliseconds is taken for one in seconds."""
+    times_ns = np.arange(100, dtype=np.int64) * 10_000_000
+    zeros = np.zeros((100, 3))
+    record = ImuRecord(times_ns + 60_000_000_000, zeros, zeros)
+    rig = replace(Rig.rectified(40.0, 40.0, 31.5, 23.5, 0.11, 64, 48), time_offset_s=offset_s)
+    with pytest.raises(DataError) as error:
+        imu_on_camera_clock(record, rig, times_ns, "imu.csv")
+    assert ("moved by the calibration's time shift" in str(error.value)) == is_named

@@ -84,6 +84,15 @@ def test_steps_that_were_off_before_make_no_jump() -> None:
     assert not any([wrong.is_settled(off=k % 3 == 0) for k in range(90)][40:])
 
 
+def test_few_steps_that_were_off_are_soon_forgotten() -> None:
+    """More than three of the twenty steps before the newest three make the gyro a wrong one."""
+    jump = GyroJump()
+    settled = [jump.is_settled(off=40 <= k < 44) for k in range(66)]
+    assert all(settled[30:46])  # only three of the four are older than the newest
+    assert not any(settled[46:63])
+    assert all(settled[63:])
+
+
 class _Turned(Flight):
     """A flight whose gyro is turned by 15 degrees about the camera's axis."""
 
@@ -107,36 +116,49 @@ def test_a_shock_of_two_frames_leaves_the_bias_where_it_was() -> None:
 
 
 def _tracks(turn: FloatArray, moving: FloatArray, *, views: int = 6) -> LinearTracks:
-    """Sixty tracks of a camera at the origin whose newest pixels are off by a rotation, and some
-    of them (60,) by a motion of their own, pixels.
+    """Tracks of a camera at the origin whose newest pixels are off by a rotation, and some of them
+    (N,) by a motion of their own, pixels.
     """
     rng = np.random.default_rng(3)
-    p = np.column_stack([rng.uniform(-3, 3, (60, 2)), rng.uniform(4, 9, 60)])
+    count = len(moving)
+    p = np.column_stack([rng.uniform(-3, 3, (count, 2)), rng.uniform(4, 9, count)])
     f = 400.0
-    J = np.zeros((60, views, 4, 3))
+    J = np.zeros((count, views, 4, 3))
     for row, shift in ((0, 0.0), (2, 0.1)):
         x = p[:, 0] - shift
         J[:, :, row, 0] = (f / p[:, 2])[:, None]
         J[:, :, row, 2] = (-f * x / p[:, 2] ** 2)[:, None]
         J[:, :, row + 1, 1] = (f / p[:, 2])[:, None]
         J[:, :, row + 1, 2] = (-f * p[:, 1] / p[:, 2] ** 2)[:, None]
-    r = rng.normal(0, 0.2, (60, views, 4))
+    r = rng.normal(0, 0.2, (count, views, 4))
     r[:, -1] += np.einsum("fki,fi->fk", J[:, -1], np.cross(turn, p))
     r[:, -1, [0, 2]] += moving[:, None]
-    at = Residuals(r, J, np.ones(60, dtype=np.bool_), np.ones((60, views, 4)))
+    at = Residuals(r, J, np.ones(count, dtype=np.bool_), np.ones((count, views, 4)))
     T = np.broadcast_to(np.eye(4), (views, 4, 4)).copy()
-    return LinearTracks(None, 0.04, T, np.arange(60), p, at, np.zeros((60, views, 4)), None)  # type: ignore[arg-type]
+    no_pixels = np.zeros((count, views, 4))
+    return LinearTracks(None, 0.04, T, np.arange(count), p, at, no_pixels, None)  # type: ignore[arg-type]
 
 
+TURN = np.array([0.004, -0.006, 0.003])
 MOVED = np.diag([1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4]) ** 2
 
 
 def test_one_rotation_of_all_old_tracks_is_found() -> None:
-    turn = np.array([0.004, -0.006, 0.003])
-    still = np.zeros(60)
-    found = turn_of_images(_tracks(turn, still), MOVED, np.eye(4))
+    found = turn_of_images(_tracks(TURN, np.zeros(60)), MOVED, np.eye(4))
     assert found is not None
-    np.testing.assert_allclose(np.abs(found), np.abs(turn), atol=3e-4)
+    np.testing.assert_allclose(np.abs(found), np.abs(TURN), atol=3e-4)
+
+
+@pytest.mark.parametrize(("count", "found"), [(14, False), (15, True)])
+def test_a_few_tracks_prove_no_rotation(count: int, found: bool) -> None:
+    turn = turn_of_images(_tracks(TURN, np.zeros(count)), MOVED, np.eye(4))
+    assert (turn is not None) == found
+
+
+@pytest.mark.parametrize(("moving", "found"), [(16, True), (24, False)])
+def test_four_fifths_of_the_tracks_must_agree_on_a_rotation(moving: int, found: bool) -> None:
+    off = np.where(np.arange(100) < moving, 6.0, 0.0)
+    assert (turn_of_images(_tracks(TURN, off), MOVED, np.eye(4)) is not None) == found
 
 
 def test_things_that_move_are_no_rotation() -> None:
@@ -145,8 +167,10 @@ def test_things_that_move_are_no_rotation() -> None:
 
 
 def test_what_has_just_come_into_view_is_not_asked() -> None:
-    young = _tracks(np.array([0.004, -0.006, 0.003]), np.zeros(60), views=3)
+    """A track is old once four views before the newest one have seen it."""
+    young = _tracks(TURN, np.zeros(60), views=4)
     assert turn_of_images(young, MOVED, np.eye(4)) is None
+    assert turn_of_images(_tracks(TURN, np.zeros(60), views=5), MOVED, np.eye(4)) is not None
 
 
 def test_a_bias_that_comes_back_has_not_jumped() -> None:
@@ -160,3 +184,17 @@ def test_a_bias_that_comes_back_has_not_jumped() -> None:
     jump.doubt(np.zeros(3), np.full(3, 0.002))
     assert jump.agrees(np.array([0.1, 0, 0])) == pytest.approx(0.1)
     assert jump.agrees(np.array([0.1, 0, 0])) is None
+
+
+@pytest.mark.parametrize(("rate", "alike"), [(0.19, True), (0.21, False)])
+def test_rates_are_alike_up_to_half_of_the_larger(rate: float, alike: bool) -> None:
+    jump = GyroJump()
+    jump.repeats(np.array([0.1, 0.0, 0.0]))
+    assert jump.repeats(np.array([rate, 0.0, 0.0])) == alike
+
+
+@pytest.mark.parametrize(("sigmas", "named"), [(2.9, False), (3.1, True)])
+def test_a_change_within_three_standard_deviations_is_no_jump(sigmas: float, named: bool) -> None:
+    jump = GyroJump()
+    jump.doubt(np.zeros(3), np.array([0.0, 0.002, 0.0]))
+    assert (jump.agrees(np.array([0.002 * sigmas, 0.0, 0.0])) is not None) == named

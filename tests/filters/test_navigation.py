@@ -16,6 +16,7 @@ from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.imu.settings import DEFAULT_IMU, ImuSettings
+from vio.imu.standstill import NOISE_FACTOR, blocks_agree
 from vio.records import ImuSample, VelocitySample
 
 SETTINGS = MsckfSettings()
@@ -203,3 +204,16 @@ def test_the_noise_of_one_reading_is_that_of_the_imus_own_period(hz: int) -> Non
     motion.forget_before(motion.samples[-1].time_ns)
     assert len(motion.samples) == 1
     assert motion.rate_variance(np.ones(2)) == pytest.approx(density**2 * hz)
+
+
+@pytest.mark.parametrize(("share", "agree"), [(0.9, True), (1.1, False)])
+def test_means_agree_up_to_what_one_standstill_in_a_thousand_shows(
+    share: float, agree: bool
+) -> None:
+    """Five means of three values have twelve degrees of freedom."""
+    limit = 32.9  # of the tables of chi-square
+    density = np.sqrt(0.1) / NOISE_FACTOR  # the mean of a tenth of a second has unit variance
+    values = np.zeros((5, 3))
+    values[2, 0] = np.sqrt(share * limit / (1 - 1 / 5))
+    times_s = -np.array([0.45, 0.35, 0.25, 0.15, 0.05])
+    assert blocks_agree(times_s, values, density) == agree

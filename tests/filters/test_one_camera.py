@@ -27,7 +27,7 @@ from vio.errors import CalibrationError, ConfigError, DataError
 from vio.evaluation.consistency import nees_bounds
 from vio.filters import mono_start
 from vio.filters.alignment import Bearings, FreeMotion, align_visual_inertial, gyro_bias
-from vio.filters.mono_msckf import MonoMsckf
+from vio.filters.mono_msckf import MonoMsckf, _for_one_camera
 from vio.filters.settings import MsckfSettings
 from vio.frontend import FrontendSettings, build_frontend
 from vio.frontend.one_camera import disparities
@@ -123,7 +123,7 @@ def _curves() -> tuple[Flown, ...]:
 
 
 # --- the start
-# ------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_start_in_motion_waits_and_is_as_good_as_it_says() -> None:
@@ -350,7 +350,7 @@ def test_virtual_baseline_makes_the_noise_of_depths_that_of_disparities(depth_m:
 
 
 # --- recordings
-# -----------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 RIG = Rig(
     CameraModel(300.0, 300.0, 239.5, 149.5, 480, 300), T_cam0_imu=np.eye(4), depth_factor=1000.0
@@ -622,7 +622,7 @@ def test_inspect_shows_depth_images_and_a_wrong_unit(
 
 
 # --- live
-# -----------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_odometry_takes_single_images_and_depths() -> None:
@@ -703,3 +703,9 @@ def test_one_camera_begins_anew_where_it_was_good() -> None:
     off = (se3_inverse(a) @ b)[:3, 3] - moved[:3, 3]
     assert off @ np.linalg.solve(last.covariance[:3, :3], off) < 16.3  # 99.9 % of 3
     assert np.arccos(last.T_world_imu[2, :3] @ b[2, :3]) < 3.0 * last.tilt_sigma_rad
+
+
+@pytest.mark.parametrize(("clones", "kept"), [(11, 20), (19, 20), (25, 25)])
+def test_one_camera_keeps_a_second_of_poses(clones: int, kept: int) -> None:
+    """At 20 frames per second: its depths come from motion alone."""
+    assert _for_one_camera(MsckfSettings(clones=clones)).clones == kept

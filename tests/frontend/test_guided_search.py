@@ -17,7 +17,7 @@ from vio.mapping.features import KeyframeFeatures
 from vio.mapping.guided_search import PlaceView, _pairs, _Target, place_points, search, shown
 from vio.mapping.loop_geometry import Terms, points_of, verify
 from vio.mapping.map_store import MapStore
-from vio.mapping.overlap import Overlaps
+from vio.mapping.overlap import Overlaps, is_visible
 
 CAMERA = StereoCamera(400.0, 400.0, 319.5, 179.5, 0.12, 640, 360)
 T_I_K = se3_exp([0.5, -0.1, 0.3, 0.04, -0.15, 0.03])
@@ -270,3 +270,9 @@ def test_windows_are_as_wide_as_the_covariance_of_the_pose_makes_them() -> None:
     np.testing.assert_allclose(
         pairs.radius, 3.0 * np.maximum(pairs.size_px, 1.0) + 3.0 * sigma, rtol=1e-6
     )
+
+
+@pytest.mark.parametrize(("ahead_m", "seen"), [(0.09, False), (0.11, True), (-1.0, False)])
+def test_points_are_visible_from_a_decimetre_ahead(ahead_m: float, seen: bool) -> None:
+    point = np.array([0.0, 0.0, ahead_m])
+    assert is_visible(point, np.zeros(3), point, np.zeros(3)) == seen

@@ -185,6 +185,16 @@ def test_points_seen_before_outvote_what_has_come_into_view() -> None:
         )
 
 
+def test_points_vote_from_their_fifth_static_frame_on() -> None:
+    """The oldest fifty of those, and all that are as old as the youngest of them."""
+    ages = np.array([4, 5, 6])
+    assert voters(ages).tolist() == [False, True, True]
+    ages = np.repeat([10, 20, 30], [40, 12, 39])
+    assert voters(ages).tolist() == (ages >= 20).tolist()
+    ages = np.repeat([10, 20, 30], [40, 12, 37])
+    assert voters(ages).all()
+
+
 def test_a_compromise_between_slow_object_and_scene_is_outvoted() -> None:
     """One motion fits the object and a part of the scene, so that no second group of points is
     left that agrees.

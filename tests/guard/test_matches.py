@@ -21,6 +21,7 @@ from vio.frontend.precomputed import PrecomputedFrontend, with_right_of
 from vio.frontend.settings import FrontendSettings
 from vio.geometry.lie import FloatArray, so3_exp
 from vio.geometry.stereo import StereoCamera
+from vio.guard.frozen_matches import FrozenMatches
 from vio.guard.guarded import GuardedFrontend
 from vio.guard.lost_matches import LostMatches
 from vio.guard.match_check import Hysteresis, SharedMatches, shared_matches
@@ -344,3 +345,46 @@ def test_shared_matches_are_those_of_both_frames() -> None:
     assert shared.rows.tolist() == [1]
     np.testing.assert_array_equal(shared.before, z[[1]])
     assert shared.seconds == pytest.approx(0.1)
+
+
+def _shared(count: int, left_px: float, right_px: float) -> SharedMatches:
+    before = np.full((count, 4), 100.0)
+    now = before + np.array([left_px, 0.0, right_px, 0.0])
+    return SharedMatches(count, np.arange(count), before, now, 0.1)
+
+
+def _frozen_frames(shared: SharedMatches) -> list[str]:
+    check = FrozenMatches()
+    for seen in flight()[:4]:
+        check.inspect(seen, shared)
+    return [finding.code for finding in check.take_findings()]
+
+
+@pytest.mark.parametrize(
+    ("count", "left_px", "right_px", "is_frozen"),
+    [
+        (8, 10.0, 0.0, True),
+        (7, 10.0, 0.0, False),  # too few to tell
+        (20, 2.1, 0.0, True),
+        (20, 1.9, 0.0, False),  # at rest both stay
+        (20, 10.0, 0.9, True),
+        (20, 10.0, 1.1, False),  # a twist moves one camera's pixels less
+    ],
+)
+def test_right_pixels_that_stay_while_left_ones_move_are_frozen(
+    count: int, left_px: float, right_px: float, is_frozen: bool
+) -> None:
+    found = _frozen_frames(_shared(count, left_px, right_px))
+    assert found == (["right-image-frozen"] if is_frozen else [])
+
+
+@pytest.mark.parametrize(("share", "is_lost"), [(0.17, True), (0.23, False)])
+def test_matches_are_lost_below_a_fifth_of_the_usual_share(share: float, is_lost: bool) -> None:
+    check = LostMatches()
+    nothing = _shared(0, 0.0, 0.0)
+    seen = flight()
+    for k, frame in enumerate(seen[:10]):
+        has_right = np.arange(len(frame)) < (1.0 if k < 5 else share) * len(frame)
+        check.inspect(replace(frame, has_right=has_right), nothing)
+    found = [finding.code for finding in check.take_findings()]
+    assert found == (["right-matches-lost"] if is_lost else [])

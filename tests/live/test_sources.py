@@ -630,3 +630,17 @@ def test_a_recording_that_needs_an_absent_package_says_so(
     recorder = Recorder(tmp_path / "kept", load_rig(flight), "mcap")
     with pytest.raises(MissingDependencyError):
         recorder.close()
+
+
+def test_an_oak_is_lost_after_five_silent_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock of which each look takes a second."""
+    monkeypatch.setitem(sys.modules, "depthai", _OakDevice())  # type: ignore[arg-type]
+    seconds = iter(range(100))
+    clock = SimpleNamespace(monotonic=lambda: float(next(seconds)), sleep=lambda seconds: None)
+    monkeypatch.setattr("vio.sources.oak.time", clock)
+    source = open_source("oak:")
+    events: list[SourceEvent | None] = []
+    with pytest.raises(DataError, match="nothing for 5 s"):
+        events.extend(source.events())
+    assert events[-5:] == [None] * 5
+    assert events[-6] is not None

@@ -39,7 +39,12 @@ from vio.offline.colmap.model import (
 )
 from vio.offline.colmap.reconstruction import linked_steps, pairs_to_match
 from vio.offline.colmap.trajectory import read_colmap_trajectory
-from vio.offline.comparison import GroundTruth, KeyframeComparison, compare_keyframes
+from vio.offline.comparison import (
+    GroundTruth,
+    KeyframeComparison,
+    _longest_piece,
+    compare_keyframes,
+)
 from vio.offline.keyframes import TrackedPath, choose_keyframes
 from vio.offline.loop_tracks import loop_rows
 from vio.offline.points import build_tracks, landmarks_of, reprojection, triangulate_tracks
@@ -641,3 +646,15 @@ def test_noise_images_are_not_calibrated(
         capsys, "calibrate", source, "--out", tmp_path / "cal", "--pairs", "3", "--frames", "4"
     )
     assert "not observable because" in facts["stereo"]["verdict"]  # type: ignore[index]
+
+
+@pytest.mark.parametrize(("off_m", "kept"), [(0.9, 20), (1.1, 12)])
+def test_a_path_is_broken_where_a_motion_is_off_by_more_than_its_length(
+    off_m: float, kept: int
+) -> None:
+    own = np.tile(np.eye(4), (20, 1, 1))
+    own[:, 0, 3] = np.arange(20)
+    other = own.copy()
+    other[12:, 0, 3] += off_m
+    piece, pieces = _longest_piece(own, other, np.ones(19, dtype=np.bool_))
+    assert (int(piece.sum()), pieces) == (kept, 1)

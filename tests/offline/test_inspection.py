@@ -29,6 +29,7 @@ from vio.geometry.lie import so3_exp
 from vio.guard.guarded import guarded
 from vio.inspection.inertial import allan_deviation, noise_part, rest_part
 from vio.inspection.inspect import _tracking_parts, clock_facts
+from vio.inspection.pictures import GrayLevels, _image_faults
 from vio.records import ImuDensities, ImuRecord
 
 
@@ -243,7 +244,7 @@ def test_pairs_of_different_times_are_named(delay: int, named: str | None) -> No
 
 
 # --- figures
-# --------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def test_rates_jitter_and_gaps() -> None:
@@ -334,3 +335,19 @@ def test_stamps_that_are_even_but_for_rounding_have_no_jitter(
     assert "Hz, even, no gap" in out
     assert "e-0" not in out
     assert "(1: blurred by 2 px or more)" in out
+
+
+@pytest.mark.parametrize(("mean", "is_named"), [(11.0, True), (13.0, False), (242.0, False)])
+@pytest.mark.parametrize("spread", [20.0])
+def test_names_images_without_light(mean: float, spread: float, is_named: bool) -> None:
+    image = np.zeros((4, 4), np.uint8)
+    levels = GrayLevels(mean, spread, 0.0, 2.0)
+    faults = _image_faults([(image,)] * 3, [[levels] * 3])
+    assert [fault.startswith("3 of 3 images are black") for fault in faults] == [True] * is_named
+
+
+@pytest.mark.parametrize(("mean", "spread"), [(244.0, 20.0), (100.0, 2.8)])
+def test_names_images_that_are_white_or_flat(mean: float, spread: float) -> None:
+    image = np.zeros((4, 4), np.uint8)
+    assert len(_image_faults([(image,)], [[GrayLevels(mean, spread, 0.0, 2.0)]])) == 1
+    assert _image_faults([(image,)], [[GrayLevels(100.0, 3.2, 0.0, 2.0)]]) == []

@@ -12,8 +12,8 @@ from tests.calibration.test_camera_imu import DENSITIES, OFFSET_S, POSE_SIGMA, _
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.records import ImuRecord
-from vio.targets.imu_checks import check_imu
-from vio.targets.inertial import calibrate_imu
+from vio.targets.imu_checks import _intervals, check_imu
+from vio.targets.inertial import _weak, calibrate_imu
 
 SWAPPED = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
 CYCLIC = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0.0]])
@@ -80,3 +80,18 @@ def test_calibrates_and_names_clocks_that_are_seconds_apart() -> None:
     found = calibrate_imu(poses, late, DENSITIES)
     assert found.time_offset_s == pytest.approx(1.7 + OFFSET_S, abs=5e-5)
     assert any("ahead of the camera's by +1.712 s" in text for text in found.weak)
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(0.45, 1), (0.55, 0)])
+def test_views_that_follow_late_give_no_rate(seconds: float, count: int) -> None:
+    """Over half a second a hand turns to and fro."""
+    times_ns = np.array([0, round(seconds * 1e9)])
+    assert len(_intervals(times_ns, np.tile(np.eye(4), (2, 1, 1))).begin_ns) == count
+
+
+@pytest.mark.parametrize(("below", "named"), [(True, 0), (False, 3 + 3 + 1)])
+def test_weak_are_five_millimetres_a_fifth_of_a_degree_and_a_millisecond(
+    below: bool, named: int
+) -> None:
+    sigma = np.repeat([0.005, np.radians(0.2), 0.001], [3, 3, 1])
+    assert len(_weak(sigma * (0.9 if below else 1.1))) == named

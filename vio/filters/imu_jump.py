@@ -29,7 +29,6 @@ class _RotationRules(NamedTuple):
     min_old_views: int = 4  # of a track before the newest: what it shows has been part of the scene
     min_old_tracks: int = 15
     min_agreeing_share: float = 0.8  # share of the old tracks that one rotation must explain
-    prior_sigma_rad: float = 0.2  # standard deviation of the rotation before it is fitted
     iterations: int = 8  # of the robust fit
 
 
@@ -41,8 +40,9 @@ class _JumpRules(NamedTuple):
 
     # of a filter that has begun, in which a bias that is learned looks like a jump
     start_steps: int = 30
-    # A jump comes after steps that agreed: of so many before the newest ones (which may belong to it) so
-    # few are off. A gyro that is wrong all the time (its axes, clock, scale) is no gyro that jumped.
+    # A jump comes after steps that agreed: of so many before the newest ones (which may belong to
+    # it) so few are off. A gyro that is wrong all the time (its axes, clock, scale) is no gyro that
+    # jumped.
     quiet_steps: int = 20
     newest_steps: int = 3
     max_off_steps: int = 3
@@ -79,9 +79,8 @@ def turn_of_images(
     about_body = np.eye(6)
     about_body[:3, 3:] = -so3_hat(p_body)
     expected = about_body @ moved @ about_body.T
-    covariance = expected.copy()
-    covariance[3:, 3:] += _ROTATION.prior_sigma_rad**2 * np.eye(3)
-    information: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    information = np.zeros((6, 6))  # of the translation alone: the gyro is in question
+    information[:3, :3] = np.linalg.inv(expected[:3, :3])
     motion, P, left = _robust_fit(B, r, information, predicted.variance)
     turn: FloatArray = motion[3:]
     squared = float(turn @ np.linalg.solve(expected[3:, 3:] + P[3:, 3:], turn))
