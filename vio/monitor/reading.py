@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vio.calibration.readings import other_reading
 from vio.findings import Finding
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray
@@ -56,6 +55,8 @@ class ReadingCheck:
         if _CODE in codes or not codes & set(_ROWS_OFF):
             return None
         self._looked += 1
+        from vio.calibration.readings import other_reading  # few runs need it
+
         found = other_reading(self._rig, self._rectified, np.concatenate(self._matches))
         if found is None:
             return None
