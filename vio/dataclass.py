@@ -120,7 +120,7 @@ class _LateInit:
 
     def __get__(self, instance: object, owner: type[Any] | None = None) -> Any:
         self._uses += 1
-        if isinstance(instance, self._cls) and self._uses <= _USES_BEFORE_COMPILING:
+        if instance is not None and self._uses <= _USES_BEFORE_COMPILING:
             return functools.partial(self._fill, instance)
         init = self._cls.__init__ = _init_of(self._cls, frozen=self._frozen)
         return init if instance is None else init.__get__(instance, owner)
