@@ -1,17 +1,16 @@
 """`dataclass` of the standard library at a tenth of its cost when a module is imported.
 
 The standard one writes six functions for each class as text and compiles them, which took a third
-of the time of all imports. Here classes share their methods. `__init__`, whose speed counts, is
-compiled when a class is made for the third time: most are made once or twice in a run. Fields,
-equality, hash, text and pickle are the same; `dataclasses.replace`, `fields` and `asdict` take the
-class. Fields have no options but default, factory, `compare`, `hash`, `repr` and metadata; a class
-that inherits from another dataclass, or writes one of the methods itself, is a standard one.
+of the time of all imports. Here classes share their methods, and `__init__`, whose speed counts,
+is compiled when it is first looked up. Fields, equality, hash, text and pickle are the same;
+`dataclasses.replace`, `fields` and `asdict` take the class. Fields have no options but default,
+factory, `compare`, `hash`, `repr` and metadata; a class that inherits from another dataclass, or
+writes one of the methods itself, is a standard one.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import reprlib
 from collections.abc import Callable
 from dataclasses import MISSING, FrozenInstanceError, fields
@@ -20,24 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 # What a class must leave to the decorator, or the standard one does it all.
 _SHARED = ("__init__", "__repr__", "__eq__", "__hash__", "__setattr__", "__delattr__")
-# Times that a class is made by looking at its fields; then `__init__` is compiled.
-_USES_BEFORE_COMPILING = 2
-
-
-@dataclasses.dataclass(slots=True)
-class _Open:
-    """What the standard library notes of a class and of a field."""
-
-    field: int = 0
-
-
-@dataclasses.dataclass(slots=True, frozen=True)
-class _Frozen:
-    """The same of one whose instances cannot change."""
-
-
-_PARAMS: dict[bool, Any] = {False: vars(_Open), True: vars(_Frozen)}
-_FIELD_KIND: Any = fields(_Open)[0]._field_type  # type: ignore[attr-defined]
 
 
 def _dataclass(*, slots: bool = False, frozen: bool = False) -> Callable[[type[Any]], type[Any]]:
@@ -46,49 +27,22 @@ def _dataclass(*, slots: bool = False, frozen: bool = False) -> Callable[[type[A
     def decorate(cls: type[Any]) -> type[Any]:
         if not slots or _needs_standard(cls):
             return dataclasses.dataclass(frozen=frozen, slots=slots)(cls)
-        own = {
-            name: f for name, kind in cls.__annotations__.items() if (f := _field(cls, name, kind))
-        }
-        left_out = {*own, "__dict__", "__weakref__"}
-        body = {name: value for name, value in vars(cls).items() if name not in left_out}
-        body |= {
-            "__slots__": tuple(own),
-            "__match_args__": tuple(own),
-            "__dataclass_fields__": own,
-            "__dataclass_params__": _PARAMS[frozen]["__dataclass_params__"],
-            "__replace__": dataclasses.replace,
-            "__qualname__": cls.__qualname__,
-            "__repr__": _repr,
-            "__eq__": _equals([name for name, f in own.items() if f.compare]),
-            "__hash__": None,
-        }
-        kind: Any = type(cls)
-        made: Any = kind(cls.__name__, cls.__bases__, body)
+        made: Any = dataclasses.dataclass(init=False, repr=False, eq=False, slots=True)(cls)
+        own = fields(made)
+        if any(f.kw_only or not f.init for f in own):
+            raise TypeError(f"{cls.__name__}: take dataclasses.dataclass for such fields")
+        stated = made.__dataclass_params__
+        stated.init = stated.repr = stated.eq = True
+        stated.frozen = frozen
         made.__init__ = _LateInit(made, frozen=frozen)
+        made.__repr__ = _repr
+        made.__eq__ = _equals([f.name for f in own if f.compare])
+        made.__hash__ = None
         if frozen:
             _freeze(made)
         return made
 
     return decorate
-
-
-def _field(cls: type[Any], name: str, kind: object) -> Any:
-    """Return the `dataclasses.Field` of an annotation; None: a variable of the class."""
-    if str(kind).removeprefix("typing.").startswith("ClassVar"):
-        return None
-    default = vars(cls).get(name, MISSING)
-    out: Any = default
-    if not isinstance(default, dataclasses.Field):
-        out = dataclasses.field(default=default)
-    if out.kw_only is True or not out.init:
-        raise TypeError(f"{cls.__name__}: take dataclasses.dataclass for such fields")
-    if type(out.default).__hash__ is None:
-        raise ValueError(f"{cls.__name__}.{name}: use a default_factory")
-    out.name = name
-    out.type = kind
-    out.kw_only = False
-    out._field_type = _FIELD_KIND
-    return out
 
 
 def _needs_standard(cls: type[Any]) -> bool:
@@ -109,41 +63,15 @@ def _freeze(made: Any) -> None:
 
 
 class _LateInit:
-    """Takes the place of a class's `__init__` until that is looked up on the class, or for the
-    third time, and then makes it.
-    """
+    """Makes the `__init__` of a class when it is looked up, and puts it in its own place."""
 
     def __init__(self, cls: type[Any], *, frozen: bool) -> None:
         self._cls = cls
         self._frozen = frozen
-        self._uses = 0
 
     def __get__(self, instance: object, owner: type[Any] | None = None) -> Any:
-        self._uses += 1
-        if instance is not None and self._uses <= _USES_BEFORE_COMPILING:
-            return functools.partial(self._fill, instance)
         init = self._cls.__init__ = _init_of(self._cls, frozen=self._frozen)
         return init if instance is None else init.__get__(instance, owner)
-
-    def _fill(self, instance: Any, *args: Any, **named: Any) -> None:
-        """Do what `__init__` does."""
-        known: dict[str, dataclasses.Field[Any]] = self._cls.__dataclass_fields__
-        given = dict(zip(known, args, strict=False))
-        if len(args) > len(known) or given.keys() & named.keys() or named.keys() - known.keys():
-            self._cls.__init__(instance, *args, **named)  # says what is wrong
-        given |= named
-        for name, f in known.items():
-            if name in given:
-                value = given[name]
-            elif f.default is not MISSING:
-                value = f.default
-            elif f.default_factory is not MISSING:
-                value = f.default_factory()
-            else:
-                self._cls.__init__(instance, *args, **named)  # says which ones are missing
-            object.__setattr__(instance, name, value)
-        if hasattr(instance, "__post_init__"):
-            instance.__post_init__()
 
 
 class _Factory:

@@ -82,41 +82,6 @@ def test_checks_are_made() -> None:
         OURS()
 
 
-@pytest.mark.parametrize("made_before", [0, 5])
-def test_each_instance_takes_the_same_arguments(made_before: int) -> None:
-    """The first ones are made without a compiled `__init__`."""
-    ours = _point(dataclass)
-    for _ in range(made_before):
-        ours(0.0)
-    own = ours(1.0, names=["a"], hidden=3)
-    assert dataclasses.asdict(own) == {"x": 1.0, "y": 2.0, "names": ["a"], "hidden": 3}
-
-
-@pytest.mark.parametrize("made_before", [0, 5])
-@pytest.mark.parametrize(
-    ("arguments", "named", "error", "said"),
-    [
-        ((), {}, TypeError, "missing 1 required positional argument: 'x'"),
-        ((1.0,), {"x": 2.0}, TypeError, "multiple values for argument 'x'"),
-        ((1.0,), {"z": 2.0}, TypeError, "unexpected keyword argument 'z'"),
-        ((1.0, 2.0, [], 0, 5), {}, TypeError, "takes from 2 to 5 positional arguments"),
-        ((-1.0,), {}, ValueError, "negative"),
-    ],
-)
-def test_each_instance_refuses_the_same_arguments(
-    made_before: int,
-    arguments: tuple[Any, ...],
-    named: dict[str, Any],
-    error: type[Exception],
-    said: str,
-) -> None:
-    ours = _point(dataclass)
-    for _ in range(made_before):
-        ours(0.0)
-    with pytest.raises(error, match=said):
-        ours(*arguments, **named)
-
-
 @pytest.mark.parametrize("name", ["value", "other"])
 def test_frozen_fields_do_not_change(name: str) -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -143,16 +108,6 @@ def test_a_record_inside_itself_is_written_once() -> None:
     own = Open()
     own.value = own  # type: ignore[assignment]
     assert repr(own) == "Open(value=...)"
-
-
-def test_a_default_that_instances_would_share_is_refused() -> None:
-    with pytest.raises(ValueError, match="default_factory"):
-
-        @dataclass(slots=True)
-        class Shared:
-            """A list is no default."""
-
-            values: list[int] = []  # noqa: RUF012
 
 
 def test_fields_of_other_kinds_are_refused() -> None:
