@@ -32,6 +32,8 @@ TWELVE_BITS = np.rint(4000 * _scene()).astype(np.uint16)
 class _Message:
     """A sensor_msgs/CompressedImage."""
 
+    format = "png"  # tells zstd apart; decoders look at the data
+
     def __init__(self, data: bytes) -> None:
         self.data = data
 
