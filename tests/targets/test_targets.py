@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -28,8 +30,16 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.images import load_gray, write_png
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, project_point
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.geometry.lie import (
+    FloatArray,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+    so3_exp,
+    transform_points,
+)
 from vio.numerics.statistics import chi_square_quantile
+from vio.records import Image, IntArray
 from vio.targets.blurred import PrintAligner
 from vio.targets.bundle import (
     Adjusted,
@@ -44,8 +54,8 @@ from vio.targets.description import Target, marker_dictionary, read_target, targ
 from vio.targets.homography import predict
 from vio.targets.lenses import LENSES, choose_lens
 from vio.targets.printing import page_of, svg_text
-from vio.targets.recording import Filmed, open_raw
-from vio.targets.rendering import BoardRenderer, Exposure
+from vio.targets.recording import Filmed, RawRecording, film, open_raw
+from vio.targets.rendering import BoardRenderer, Exposure, board_points
 from vio.targets.results import basalt_text
 from vio.targets.start import one_camera, pair_start, poses_of
 from vio.targets.verdict import (
@@ -206,21 +216,72 @@ def test_finds_corners_through_a_lens_of_150_degrees() -> None:
         Target("charuco", 6, 8, 0.05, 0.7, "DICT_4X4_50", legacy=True),
         Target("checkerboard", 6, 9, 0.05),
         Target("checkerboard", 6, 8, 0.05),
+        Target("checkerboard", 6, 6, 0.05),
+        Target("checkerboard", 7, 7, 0.05),
     ],
-    ids=["charuco", "legacy charuco", "checkerboard", "even checkerboard"],
+    ids=["charuco", "legacy charuco", "checkerboard", "even", "even square", "odd square"],
 )
-@pytest.mark.parametrize("turn", [0.1, 3.0], ids=["upright", "turned"])
+@pytest.mark.parametrize("turn", [0.1, 1.9, 3.0], ids=["upright", "on its side", "turned"])
 def test_finds_corners_of_other_boards(target: Target, turn: float) -> None:
     R = so3_exp([0, 0, turn]) @ so3_exp([0.3, -0.2, 0])
     centre = np.array([*(0.5 * np.array(target.extent_m)), 0.0])
     T = se3_from_parts(R, [0.0, 0.0, 0.6] - R @ centre)
     found, uv, inside = _detected(target, SMALL_LEFT, T, Exposure(0.6, 2.0))
-    truth = uv[found.ids]
-    if target.kind == "checkerboard" and (target.rows + target.cols) % 2 == 0 and turn > 1:
-        truth = uv[::-1][found.ids]  # which nobody can tell apart
+    # Of the orders that nobody can tell apart, the one whose first corners are upper left.
+    last = 0 if target.kind == "charuco" else target.cols - 2  # of the first row
+    orders = [uv[order] for order in target.symmetries()]
+    truth = max(orders, key=lambda one: (one[last] - one[0])[0] + (one[-1] - one[last])[1])
+    truth = truth[found.ids]
     assert len(found) > 0.9 * inside.sum()
     assert np.median(np.linalg.norm(found.uv - truth, axis=1)) < 0.15
     assert np.abs(np.mean(found.uv - truth, axis=0)).max() < 0.05
+
+
+@dataclass
+class TurnedNumbers:
+    """Stands in for the detector: an image's number says which corners, numbered in any order in
+    which the board looks the same.
+    """
+
+    target: Target
+    uv: dict[int, FloatArray]
+
+    def detect(self, image: Image) -> Corners:
+        number = int(image[0, 0])
+        orders = self.target.symmetries()
+        return Corners(self.target_ids, self.uv[number][orders[number % 7 % len(orders)]])
+
+    @property
+    def target_ids(self) -> IntArray:
+        return np.arange(len(self.target.points_m))
+
+
+@pytest.mark.parametrize(
+    "target",
+    [Target("checkerboard", 7, 7, 0.05), Target("checkerboard", 6, 8, 0.05)],
+    ids=["square", "even"],
+)
+def test_numbers_a_board_that_looks_the_same_turned_alike_in_all_images(target: Target) -> None:
+    points = board_points(target)
+    uv: dict[int, FloatArray] = {}
+    for k, roll in enumerate(np.linspace(0, 2 * np.pi, 24)):
+        R = so3_exp([0.3, -0.2, 0]) @ so3_exp([0, 0, roll])
+        T = se3_from_parts(R, [0.0, 0.0, 1.0] - R @ points.mean(axis=0))
+        uv[k] = project_point(LEFT, transform_points(T, points))[0]
+        uv[k + 100] = project_point(RIGHT, transform_points(T_RIGHT_LEFT @ T, points))[0]
+
+    def load(chosen: Sequence[int]) -> Iterator[tuple[int, tuple[Image, ...]]]:
+        for k in chosen:
+            yield k, tuple(np.full((8, 8), n, dtype=np.uint8) for n in (k, k + 100))
+
+    raw = RawRecording(Path("board"), list(range(24)), load, lambda: None)
+    filmed = film(raw, cast("CornerDetector", TurnedNumbers(target, uv)))
+    assert len(filmed.views) == 24
+    first = filmed.views[0].corners[0].uv
+    order = next(o for o in target.symmetries() if np.allclose(uv[0][o], first))
+    for view in filmed.views:
+        for corners, number in zip(view.corners, (view.time_ns, view.time_ns + 100), strict=True):
+            assert np.allclose(corners.uv, uv[number][order][corners.ids])
 
 
 def test_opencv_agrees_on_the_charuco_board() -> None:
@@ -447,6 +508,19 @@ def test_refuses_exchanged_cameras() -> None:
     exchanged = [View(one.time_ns, one.corners[::-1]) for one in made_views(2, 12)]
     with pytest.raises(DataError, match="exchange left and right images"):
         calibrate_cameras(_filmed(exchanged), GRID, "radtan")
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_refuses_a_pair_that_no_rectification_holds(sign: int) -> None:
+    turned = []
+    for view in made_views(2, 12):
+        left, right = view.corners
+        u, v = right.uv.T
+        uv = np.column_stack([479 - v, u] if sign > 0 else [v, 751 - u])
+        turned.append(replace(view, corners=(left, replace(right, uv=uv))))
+    filmed = replace(_filmed(turned), sizes=((752, 480), (480, 752)))
+    with pytest.raises(DataError, match=r"right camera is turned by (89|90|91) degrees"):
+        calibrate_cameras(filmed, GRID, "radtan")
 
 
 def _fill(folder: Path, shapes: dict[str, list[tuple[int, int]]]) -> Path:

@@ -19,7 +19,7 @@ def add_parser(commands: Any) -> None:
         help="measure the noise of an IMU from a record at rest",
         description="Compute the overlapping Allan deviation of an IMU's record at rest (an hour "
         "or more; five minutes at least): white noise, bias instability and random walk with "
-        "intervals of 95 %%, a plot, and Kalibr's imu.yaml for use while moving.",
+        "intervals of 95 %, a plot, and Kalibr's imu.yaml for use while moving.",
     )
     parser.add_argument("imu", type=Path, metavar="FILE", help="imu.csv: time, gyro, accelerometer")
     parser.add_argument(

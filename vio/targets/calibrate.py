@@ -41,7 +41,7 @@ class _ViewRules(NamedTuple):
 _VIEWS = _ViewRules()
 _SAME_PLACE_PX = 2.0  # between the corners of two images, below which they show one view
 _DOUBTFUL_PX = 0.5  # residual beyond which the images are asked whether the board is the file's
-_MAX_TURN_DEG = 90.0  # of a pair's cameras against each other, which no rectification holds
+_MAX_TURN_DEG = 60.0  # of a pair's cameras against each other: rectifying turns each by 30 at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,11 +218,12 @@ def _check_views(filmed: Filmed, target: Target) -> None:
                     "needed: record 30 s of it at several distances and tilts"
                 )
             # A checkerboard without markers is counted from its outermost corners.
-            whole = "show all of it" if target.kind == "checkerboard" else "move it closer"
+            whole = "show all of it, " if target.kind == "checkerboard" else ""
             raise DataError(
                 f"the {name} camera sees the board in {count} of {filmed.frames} frames, and "
-                f"{MIN_VIEWS} are needed; check that the target file is that of the board, {whole}, "
-                "light it well, focus, and record 30 s of it at several distances and tilts"
+                f"{MIN_VIEWS} are needed; check that the target file is that of the board, {whole}"
+                "move it closer, light it well, focus, and record 30 s of it at several distances "
+                "and tilts"
             )
         places = _places(filmed, c)
         if places < MIN_VIEWS:

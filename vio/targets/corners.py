@@ -84,6 +84,39 @@ class Corners:
 NO_CORNERS = Corners(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
 
 
+def numbered_alike(corners: Corners, other: Corners, target: Target) -> Corners:
+    """Number the corners of a board that looks the same when it is turned as in another image.
+
+    Args:
+        corners: of an image.
+        other: of an image in which the board is turned by less than 45 degrees against it, such as
+            that of the pair's other camera, or the one before.
+        target: the board.
+    """
+    orders = target.symmetries()
+    if len(orders) == 1 or not len(corners) or not len(other):
+        return corners
+    expected = _uv_D_board(other.ids, other.uv, target)
+    numbered = [np.argsort(order)[corners.ids] for order in orders]
+    alike = [np.sum(expected * _uv_D_board(ids, corners.uv, target)) for ids in numbered]
+    ids = numbered[int(np.argmax(alike))]
+    rows = np.argsort(ids)
+    return Corners(ids[rows], corners.uv[rows])
+
+
+def _uv_D_board(ids: IntArray, uv: FloatArray, target: Target) -> FloatArray:
+    """Return the affine part (2, 2) of how corners are mapped, transposed."""
+    board = target.points_m[ids]
+    return np.linalg.lstsq(board - board.mean(axis=0), uv - uv.mean(axis=0), rcond=None)[0]
+
+
+def _uprightness(grid: FloatArray) -> float:
+    """Return how far the rows and columns of corners (R, C, 2) lead right and down, pixels."""
+    across = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0)
+    down = grid[-1].mean(axis=0) - grid[0].mean(axis=0)
+    return float(across[0] + down[1])
+
+
 class CornerDetector:
     """Finds the corners of one board in images (H, W)."""
 
@@ -93,8 +126,13 @@ class CornerDetector:
         self._markers = {marker.id: marker for marker in target.markers()}
         self._templates = _Templates(target, self._markers)
         self._aligner = PrintAligner(target)
-        squares = target.rows + target.cols
-        self._looks_the_same_turned = target.kind == "checkerboard" and squares % 2 == 0
+        self._symmetries = target.symmetries()
+        # Places in which the inner corners, without colours, are the same.
+        self._turns = 4 if target.rows == target.cols else 2
+        # No turn of such a checkerboard brings a dark square to where a light one is.
+        self._may_begin_light = (
+            target.kind == "checkerboard" and len(self._symmetries) == self._turns
+        )
         self._seeding = None if target.kind == "checkerboard" else MarkerReader(target)
 
     def detect(self, image: Image) -> Corners:
@@ -128,15 +166,20 @@ class CornerDetector:
     def _turned_by_colour(
         self, image: Image, board: FloatArray, uv: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Turn a checkerboard by 180 degrees where its first square would be light."""
-        if not len(uv) or self._looks_the_same_turned:
+        """Turn a checkerboard to where its first square is dark, and of its places that look alike
+        to the most upright one.
+        """
+        if not len(uv):
             return board, uv
-        _, H = predict(board, board, uv, leave_out=True)
-        every = np.arange(len(board))
-        like = self._templates.likeness(image, every, np.zeros_like(uv), H)
-        if float(np.median(like)) >= 0:
-            return board, uv
-        return board, uv[::-1]
+        shape = (self.target.rows - 1, self.target.cols - 1, 2)
+        if not self._may_begin_light:
+            _, H = predict(board, board, uv, leave_out=True)
+            every = np.arange(len(board))
+            like = self._templates.likeness(image, every, np.zeros_like(uv), H)
+            if float(np.median(like)) < 0:
+                uv = np.rot90(uv.reshape(shape), 4 // self._turns).reshape(-1, 2)
+        alike = [uv[order] for order in self._symmetries]
+        return board, max(alike, key=lambda one: _uprightness(one.reshape(shape)))
 
     def _grown(self, image: Image, board: FloatArray, uv: FloatArray, blur_px: float) -> FloatArray:
         """Pixels (N, 2) of the board's corners; NaN: not found."""
@@ -202,7 +245,7 @@ class CornerDetector:
         )
         good &= inside.all(axis=1)
         like = self._templates.likeness(image, ids, out - uv, H)
-        if self._looks_the_same_turned:
+        if self._may_begin_light:
             like = np.abs(like)  # its first square may be light
         good &= like > _CHECK.min_likeness
         return out, good
@@ -222,7 +265,7 @@ class CornerDetector:
         good = good.copy()
         if len(rows):
             out[rows], like = self._aligner.aligned(image, ids[rows], uv[rows], H[rows], blur_px)
-            if self._looks_the_same_turned:
+            if self._may_begin_light:
                 like = np.abs(like)
             good[rows] = like > _REFINEMENT.min_print_likeness
         return out, good

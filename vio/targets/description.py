@@ -129,6 +129,21 @@ class Target:
             for n, found in enumerate(self.marker_corners())
         ]
 
+    def symmetries(self) -> tuple[IntArray, ...]:
+        """Return the orders (N,) of `points_m` in which the board, turned, looks as it is; the first
+        is that of its frame. A checkerboard alone has others.
+        """
+        points = np.arange(len(self.points_m))
+        if self.kind != "checkerboard":
+            return (points,)
+        grid = points.reshape(self.rows - 1, self.cols - 1)
+        quarters: tuple[int, ...] = (0,)
+        if self.rows == self.cols and self.rows % 2 == 1:
+            quarters = (0, 1, 2, 3)
+        elif (self.rows + self.cols) % 2 == 0:
+            quarters = (0, 2)
+        return tuple(np.rot90(grid, quarter).ravel() for quarter in quarters)
+
     def marker_corners(self) -> list[FloatArray]:
         """Return the corners (4, 2) of the coded squares, in the order of their numbers."""
         if self.kind == "checkerboard":
@@ -261,7 +276,7 @@ def target_text(target: Target) -> str:
             "squaresX": target.cols,
             "squaresY": target.rows,
             "squareSize": f"{target.size_m!r}  # [m] side of a square: measure it",
-            "markerSize": f"{target.ratio * target.size_m!r}  # [m]",
+            "markerSize": f"{target.ratio * target.size_m:.9g}  # [m]",
             "dictionary": target.dictionary,
             "legacyPattern": str(target.legacy).lower(),
         }

@@ -31,7 +31,7 @@ from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel
 from vio.protocols import Dataset, Progress
 from vio.records import Image, ImuRecord, ImuSample
-from vio.targets.corners import CornerDetector, Corners
+from vio.targets.corners import NO_CORNERS, CornerDetector, Corners, numbered_alike
 from vio.targets.views import View
 
 MAX_FRAMES = 80  # in which the board is looked for, spread over the recording
@@ -286,6 +286,7 @@ def film(
     samples: list[Images] = []
     sizes: tuple[tuple[int, int], ...] = ()
     frames = 0
+    latest = NO_CORNERS  # of the image in which the board was last seen
     between = max(len(chosen) // _FRAMES.kept_frames, 1)
     for time_ns, images, corners in _detect(raw.load(chosen), detector):
         if frames % between == 0:
@@ -293,7 +294,11 @@ def film(
         frames += 1
         sizes = tuple((image.shape[1], image.shape[0]) for image in images)
         if any(len(one) for one in corners):
-            views.append(View(time_ns, corners))
+            alike: list[Corners] = []
+            for one in corners:
+                alike.append(numbered_alike(one, latest, detector.target))
+                latest = alike[-1] if len(one) else latest
+            views.append(View(time_ns, tuple(alike)))
         progress(frames, len(chosen))
     if not frames:
         raise DataError(f"{raw.path}: no image could be read; copy it again")

@@ -228,7 +228,9 @@ def _correlation(values: FloatArray, looks: Single, weight: FloatArray) -> Singl
 
 
 def checkerboard_seeds(image: Image, target: Target) -> tuple[FloatArray, FloatArray]:
-    """All inner corners of a checkerboard: (N, 2) on the board, (N, 2) pixels; or none."""
+    """All inner corners of a checkerboard: (N, 2) on the board, (N, 2) pixels; or none. The board may
+    be turned by quarters if it is square, and else by 180 degrees.
+    """
     import cv2
 
     size = (target.cols - 1, target.rows - 1)
@@ -243,10 +245,7 @@ def checkerboard_seeds(image: Image, target: Target) -> tuple[FloatArray, FloatA
     grid = uv.reshape(target.rows - 1, target.cols - 1, 2)
     across = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0)
     down = grid[-1].mean(axis=0) - grid[0].mean(axis=0)
-    # A board without codes looks the same when turned by 180 degrees, and not when mirrored.
+    # A board without codes looks the same when it is turned, and not when it is mirrored.
     if across[0] * down[1] - across[1] * down[0] < 0:
         grid = grid[:, ::-1]
-        across = -across
-    if across[0] + down[1] < 0:
-        grid = grid[::-1, ::-1]
     return target.points_m, grid.reshape(-1, 2)
