@@ -24,8 +24,8 @@ from tests.datasets.test_datasets_bags import (  # noqa: E402
 )
 from tests.same_events import frames_of  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
-from vio.datasets.bags.index import joined_record  # noqa: E402
 from vio.geometry.lie import se3_exp, se3_inverse  # noqa: E402
+from vio.imu.two_sensors import joined_record  # noqa: E402
 from vio.protocols import Dataset  # noqa: E402
 from vio.records import ImuSample  # noqa: E402
 

@@ -15,6 +15,7 @@ from vio.datasets.tables import read_imu_table
 from vio.errors import DataError
 from vio.files.stamps import FRAME_PACE, SAMPLE_PACE, parse_stamps
 from vio.files.units import ACCEL_UNITS, GYRO_UNITS, factor_of, time_unit, without_unit
+from vio.records import ImuSample
 
 DEG = np.pi / 180
 G = 9.80665
@@ -261,3 +262,43 @@ def test_real_readings_in_degrees_and_g_are_those_of_the_published_record(
     frames = sorted(int(path.stem) for path in (mav / "cam0" / "data").glob("*.png"))
     shown = (record.times_ns >= frames[0]) & (record.times_ns <= frames[20])
     assert np.median(np.linalg.norm(record.gyro[shown], axis=1)) == pytest.approx(0.2205, abs=2e-3)
+
+
+@pytest.mark.parametrize("names", [("gyro.csv", "accel.csv"), ("gyroscope.txt", "acc.csv")])
+def test_a_gyro_and_an_accelerometer_in_two_files_are_joined(
+    names: tuple[str, str], tmp_path: Path
+) -> None:
+    """The accelerometer has half of the rate, an offset of 1 ms, g and another order of axes."""
+    folder = make_plain(tmp_path, 8)
+    whole = read_imu_table(folder / "imu.csv")[0]
+    (folder / "imu.csv").unlink()
+    gyro = [f"{t},{x},{y},{z}" for t, (x, y, z) in zip(whole.times_ns, whole.gyro, strict=True)]
+    slow = slice(0, None, 2)
+    accel = [
+        f"{t + 1_000_000},{z / G},{x / G},{y / G}"
+        for t, (x, y, z) in zip(whole.times_ns[slow], whole.accel[slow], strict=True)
+    ]
+    (folder / names[0]).write_text("\n".join(["timestamp [ns],wx,wy,wz", *gyro]) + "\n")
+    (folder / names[1]).write_text("\n".join(["timestamp [ns],az [g],ax,ay", *accel]) + "\n")
+    dataset = open_dataset(folder)
+    assert dataset.recording.motion == {"imu"}
+    assert any("are joined" in note for note in dataset.recording.notes)
+    samples = [e for e in dataset.events() if isinstance(e, ImuSample)]
+    assert len(samples) > len(whole.times_ns) - 4
+    for sample in samples:
+        k = int(np.flatnonzero(whole.times_ns == sample.time_ns)[0])
+        np.testing.assert_allclose(sample.gyro, whole.gyro[k])
+        np.testing.assert_allclose(sample.accel[:2], whole.accel[k, :2], atol=1e-9)
+        assert sample.accel[2] == pytest.approx(
+            whole.accel[k, 2] + 0.2, abs=1e-6
+        )  # falls by 1 in 5 ms
+
+
+def test_a_gyro_and_an_accelerometer_of_other_times_are_refused(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    (folder / "imu.csv").unlink()
+    for name, first in (("gyro", 0), ("accel", 10**11)):
+        rows = [f"{first + k * 5_000_000},0.1,0.2,0.3" for k in range(50)]
+        (folder / f"{name}.csv").write_text("\n".join(["timestamp [ns],x,y,z", *rows]) + "\n")
+    with pytest.raises(DataError, match="none of its times lies between"):
+        open_dataset(folder)

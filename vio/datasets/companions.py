@@ -21,12 +21,19 @@ from vio.datasets.rigs.eth3d import EXTRINSICS, FOLDERS, is_eth3d, truth_of_left
 from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transform
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.tables import holds_readings, read_imu_table, read_velocity_table
+from vio.datasets.tables import (
+    holds_readings,
+    read_imu_table,
+    read_sensor_table,
+    read_velocity_table,
+)
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.imu.clocks import judge_clocks
+from vio.imu.sampling import sampling_notes
+from vio.imu.two_sensors import joined_record
 from vio.records import (
     NS_PER_S,
     ImuRecord,
@@ -38,6 +45,8 @@ from vio.records import (
 )
 
 IMU_FILES = ("imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv")
+_GYRO_NAMES = ("gyro", "gyr", "gyroscope")
+_ACCEL_NAMES = ("accel", "acc", "accelerometer")
 _REFERENCES = (
     "reference.tum", "reference.txt", "groundtruth.tum", "groundtruth_tum.txt", "groundtruth.txt", "gt_imu.csv",
     "mocap0/data.csv", "state_groundtruth_estimate0/data.csv", "poses.txt",
@@ -223,10 +232,10 @@ def _read_motion(
     """Read the IMU and the velocities, on the clock of the images; return the samples, their
     files and notes.
     """
-    imu = _imu_file(layout)
+    imu = imu_files(layout.root, layout.base)
     velocity = layout.root / "velocity.csv"
-    files = [f for f in (imu, velocity) if f is not None and f.is_file()]
-    others = _other_imu_notes(layout) if imu is None else []
+    files = [*imu, *([velocity] if velocity.is_file() else [])]
+    others = [] if imu else _other_imu_notes(layout)
     if not files:
         return in_time_order(), [], others
     if not timed:
@@ -242,9 +251,9 @@ def _read_motion(
         )
     parts: list[Sequence[MotionSample]] = []
     notes = others
-    if imu is not None:
-        record, notes_read = read_imu_table(imu, cut=notes)
-        samples, notes_moved = imu_on_camera_clock(record, rig, times_ns, imu)
+    if imu:
+        record, notes_read = _read_imu(imu, notes)
+        samples, notes_moved = imu_on_camera_clock(record, rig, times_ns, imu[0])
         notes += [*notes_read, *notes_moved]
         parts.append(samples)
     if velocity.is_file():
@@ -254,10 +263,43 @@ def _read_motion(
     return in_time_order(*parts), files, notes
 
 
-def _imu_file(layout: Layout) -> Path | None:
-    """Return the table of the IMU; None: there is none."""
-    named = (base / name for base in (layout.root, layout.base) for name in IMU_FILES)
-    return next((file for file in named if file.is_file()), None)
+def imu_files(*folders: Path) -> tuple[Path, ...]:
+    """Return the table of the IMU in one of some folders, or those of a gyro and an accelerometer,
+    in this order; none: there are none.
+    """
+    for folder in folders:
+        if found := [folder / name for name in IMU_FILES if (folder / name).is_file()]:
+            return (found[0],)
+    for folder in folders:
+        gyro, accel = (
+            next((f for name in names for f in sorted(folder.glob(f"{name}.[ct][sx][vt]"))), None)
+            for names in (_GYRO_NAMES, _ACCEL_NAMES)
+        )
+        if gyro is not None and accel is not None:
+            return gyro, accel
+    return ()
+
+
+def _read_imu(files: Sequence[Path], notes: list[str]) -> tuple[ImuRecord, Sequence[str]]:
+    """Read what `imu_files` has found, and what is to be noted of it; `notes` gets what tables cut
+    short are noted with.
+
+    Raises:
+        DataError: as `read_imu_table`, or no reading of the gyro lies between two of the
+            accelerometer.
+    """
+    if len(files) == 1:
+        return read_imu_table(files[0], cut=notes)
+    gyro, accel = files
+    record = joined_record(
+        read_sensor_table(gyro, "gyro", notes), read_sensor_table(accel, "accelerometer", notes)
+    )
+    if record is None:
+        raise DataError(f"{gyro}: none of its times lies between those of {accel}")
+    joined = (
+        f"{gyro} and {accel.name} are joined, the acceleration interpolated at the gyro's stamps"
+    )
+    return record, (joined, *sampling_notes(record, str(gyro)))
 
 
 def _other_imu_notes(layout: Layout) -> list[str]:

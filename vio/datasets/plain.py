@@ -26,10 +26,10 @@ from vio.cameras.rig import Rig
 from vio.dataclass import dataclass
 from vio.datasets import rigs
 from vio.datasets.companions import (
-    IMU_FILES,
     ReadImages,
     calibration_beside,
     find_calibration_of,
+    imu_files,
     read_companions,
 )
 from vio.datasets.euroc import is_euroc_folder, read_euroc
@@ -219,7 +219,7 @@ def holds_more_than_kitti(path: Path) -> bool:
     """
     if not is_plain_folder(path):
         return False
-    if any((path / name).is_file() for name in IMU_FILES):
+    if imu_files(path):
         return True
     return rigs.find_calibration(path) not in (None, path / "calib.txt")
 

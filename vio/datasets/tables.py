@@ -11,6 +11,7 @@ from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -342,6 +343,34 @@ def read_imu_table(
         accel if accel_factor == 1.0 else accel * accel_factor,
     )
     return record, (*notes, *gyro_notes, *accel_notes, *sampling_notes(record, str(path)))
+
+
+def read_sensor_table(
+    path: Path, sensor: Literal["gyro", "accelerometer"], notes: list[str]
+) -> tuple[IntArray, FloatArray]:
+    """Read the readings of one sensor; a header may name the order of its axes, and their units.
+
+    Args:
+        path: the file.
+        sensor: what it holds.
+        notes: where to note what is converted, left out or sorted.
+
+    Returns:
+        Stamps (N,) in nanoseconds and readings (N, 3) in rad/s or m/s^2.
+
+    Raises:
+        DataError: a line lacks four finite numbers, or the stamps do not increase.
+    """
+    units, si = (GYRO_UNITS, "rad/s") if sensor == "gyro" else (ACCEL_UNITS, "m/s^2")
+    table = read_table(path, 4, f"timestamp, {sensor} x y z [{si}]", notes)
+    times_ns = stamps_ns(table, SAMPLE_PACE, notes)
+    table, times_ns = _without_gaps(table, times_ns, notes)
+    table, times_ns = in_order(table, times_ns, notes)
+    axes = [_sensor_and_axis(cell)[1] for cell in table.header[1:]]
+    order = [axes.index(axis) for axis in "xyz"] if sorted(axes) == ["x", "y", "z"] else range(3)
+    factor, said = _factor(table, order, units, sensor, si)
+    notes += said
+    return times_ns, _finite(table)[:, order] * factor
 
 
 def _without_gaps(

@@ -31,22 +31,11 @@ from vio.datasets.rigs.camera_info import CameraInfo, region_of
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, se3_inverse
+from vio.imu.two_sensors import GAPS, joined_record
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, ImuRecord, IntArray, Trajectory, VelocitySample
 
 __all__ = ["BagIndex", "Stamps", "camera_info_of", "index_bag", "info_topic", "stamp_of"]
-
-
-class _GapRules(NamedTuple):
-    """When an accelerometer's readings have a gap."""
-
-    # An accelerometer's readings further apart than so many usual intervals, and so much time, are
-    # a gap, over which its readings are not interpolated.
-    usual_intervals: float = 8.0
-    min_ns: int = 100_000_000
-
-
-_GAPS = _GapRules()
 
 
 class _MixedRules(NamedTuple):
@@ -222,37 +211,6 @@ class BagIndex:
                     reached[there] = T @ reached[here]
                     waiting.append(there)
         return reached.get(target)
-
-
-def joined_record(
-    gyro: tuple[IntArray, FloatArray], accel: tuple[IntArray, FloatArray]
-) -> ImuRecord | None:
-    """Return one record of a gyro and an accelerometer with stamps of their own.
-
-    The acceleration is interpolated at the gyro's stamps (N,); those before its first reading,
-    behind its last one, or in a gap of it are left out.
-
-    Args:
-        gyro: increasing stamps (N,) and rad/s (N, 3).
-        accel: increasing stamps (M,) and m/s^2 (M, 3).
-
-    Returns:
-        The record; None where no stamp of the gyro lies between readings of the accelerometer.
-    """
-    times, rates = gyro
-    accel_ns, forces = accel
-    if len(accel_ns) < 2:
-        return None
-    after = np.clip(np.searchsorted(accel_ns, times), 1, len(accel_ns) - 1)
-    steps = np.diff(accel_ns)
-    longest = max(_GAPS.usual_intervals * float(np.median(steps)), _GAPS.min_ns)
-    inside = (times >= accel_ns[0]) & (times <= accel_ns[-1]) & (steps[after - 1] <= longest)
-    if not inside.any():
-        return None
-    at = (times[inside] - accel_ns[0]).astype(np.float64)
-    known = (accel_ns - accel_ns[0]).astype(np.float64)
-    columns = [np.interp(at, known, forces[:, axis]) for axis in range(3)]
-    return ImuRecord(times[inside], rates[inside], np.stack(columns, axis=1))
 
 
 def _trajectory(rows: Rows, *, imu: bool) -> Trajectory | None:
@@ -564,7 +522,7 @@ def _stamped(name: str, rows: Rows, behind_ns: int) -> list[str]:
 def _begins_at_zero(rows: Rows) -> bool:
     """Return whether the stamps count from the first one, so that 0 is a time."""
     steps = np.diff(np.unique(np.array(rows.times_ns, dtype=np.int64)))
-    return len(steps) > 1 and int(steps[0]) <= _GAPS.usual_intervals * float(np.median(steps[1:]))
+    return len(steps) > 1 and int(steps[0]) <= GAPS.usual_intervals * float(np.median(steps[1:]))
 
 
 def _info(index: BagIndex, fields: Any, message: Message) -> None:
