@@ -137,14 +137,16 @@ class PairingCheck(ImageCheck):
 
     def _count(self, index: int, now: _Halves, last: _Halves) -> None:
         """Count the matches of a frame, and decide once those of enough frames tell."""
-        if self._looks_exchanged(now):
+        given = self._on_rows(now, now)
+        if self._looks_exchanged(now, given):
             self._last = None
             self._recent.clear()
             return
         points = min(len(now.corners), len(last.corners))
         if points >= _PAIRING.min_points:
             self._points += points
-            self._add({0: (now, now), 1: (last, now), -1: (now, last)}, self._matched)
+            self._matched[0] += given
+            self._add({1: (last, now), -1: (now, last)}, self._matched)
         told = told_delay(self._points, self._matched)
         self._told.append(told if told == 0 else self._far_delay(now))
         recent = self._told[-_PAIRING.alike_frames :]
@@ -162,15 +164,19 @@ class PairingCheck(ImageCheck):
     ) -> None:
         """Add how many corners of the left image of each pairing match in its right one."""
         for delay, (left, right) in pairings.items():
-            matched[delay] += self._probe.on_rows(left.left, right.right, left.corners)
+            matched[delay] += self._on_rows(left, right)
 
-    def _looks_exchanged(self, now: _Halves) -> bool:
-        """Whether the images of a frame match if left and right are exchanged: the rows of an
-        exchanged pair agree, those of images of two times do not.
+    def _on_rows(self, left: _Halves, right: _Halves) -> int:
+        """Count the corners of one frame's left image that match in another one's right image."""
+        return self._probe.on_rows(left.left, right.right, left.corners)
+
+    def _looks_exchanged(self, now: _Halves, given: int) -> bool:
+        """Whether the images of a frame match if left and right are exchanged, beside the number
+        that match as given: the rows of an exchanged pair agree, those of images of two times do
+        not.
         """
         corners = self._probe.corners(now.right)
         matched = self._probe.on_rows(now.right, now.left, corners)
-        given = self._probe.on_rows(now.left, now.right, now.corners)
         few = max(_PAIRING.min_share * len(corners), _PAIRING.clear_factor * given)
         return len(corners) >= _PAIRING.min_points and matched >= few
 

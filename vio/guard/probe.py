@@ -76,7 +76,7 @@ class RowProbe:
         other pairings of the same images are not to pay for it: rows as calibrated count as well.
         """
         return max(
-            self._well_matched(left, shifted_rows(right, rows), points) for rows in {0, self._rows}
+            _well_matched(left, shifted_rows(right, rows), points) for rows in {0, self._rows}
         )
 
     def near_rows(self, left: Image, right: Image, points: FloatArray) -> IntArray:
@@ -85,41 +85,40 @@ class RowProbe:
         """
         counts = {
             rows: [
-                self._well_matched(left, _between_rows(right, rows + near), points)
+                _well_matched(left, _between_rows(right, rows + near), points)
                 for near in _NEAR_ROWS
             ]
             for rows in {0, self._rows}
         }
         return np.array(counts[0] + counts[self._rows], dtype=np.int64)
 
-    def _well_matched(self, left: Image, right: Image, points: FloatArray) -> int:
-        reach = _PROBE.usual_disparity * 2 * left.shape[1]
-        return int(
-            match_rows(
-                left, right, points, reach, ROW_SEARCH.good_correlation, ROW_SEARCH.min_margin
-            )[1].sum()
-        )
-
-    def _count(
-        self, left: Image, right: Image, points: FloatArray, rows: int, correlation: float
-    ) -> int:
-        reach = ROW_SEARCH.max_disparity * 2 * left.shape[1]
-        other = shifted_rows(right, rows)
-        return int(
-            match_rows(left, other, points, reach, correlation, ROW_SEARCH.min_margin)[1].sum()
-        )
-
     def _search(self, left: Image, right: Image, points: FloatArray) -> None:
         """Take the row difference at which most pixels match well, where it is a clear one."""
         self._searched = True
         tried = range(-ROW_SEARCH.max_rows_half, ROW_SEARCH.max_rows_half + 1)
-        counts = [
-            self._count(left, right, points, rows, ROW_SEARCH.good_correlation) for rows in tried
-        ]
+        reach = ROW_SEARCH.max_disparity
+        counts = [_well_matched(left, shifted_rows(right, k), points, reach) for k in tried]
         best = int(np.argmax(counts))
         present = counts[self._rows + ROW_SEARCH.max_rows_half]
         if counts[best] >= max(ROW_SEARCH.few_share * len(points), _PROBE.clear_ratio * present):
             self._rows = tried[best]
+
+
+def _well_matched(
+    left: Image, right: Image, points: FloatArray, reach: float = _PROBE.usual_disparity
+) -> int:
+    """Count the pixels (N, 2) of the left image that match well, by disparities up to a share of
+    the width.
+    """
+    found = match_rows(
+        left,
+        right,
+        points,
+        reach * 2 * left.shape[1],
+        ROW_SEARCH.good_correlation,
+        ROW_SEARCH.min_margin,
+    )
+    return int(found[1].sum())
 
 
 def _signed(left: Image, right: Image, points: FloatArray) -> int:
