@@ -38,11 +38,10 @@ def gray_of(
         UnreadableImageError: the pixels are truncated or do not decode.
         DataError: the encoding is not read.
     """
-    if compressed and is_packed(fields):
-        fields = unpacked(fields, where)
-    elif compressed:
+    raw = _raw_fields(fields, where, compressed=compressed)
+    if raw is None:
         return decode_gray(bytes(fields.data), where, levels, colour=colour)
-    return to_8_bits(raw_gray(fields, where, colour=colour), levels)
+    return to_8_bits(raw_gray(raw, where, colour=colour), levels)
 
 
 # height, width, whether big-endian, bytes a row, and length of the encoding that follows
@@ -50,12 +49,16 @@ _PACKED = struct.Struct("<IIBII")
 _ZSTD_START = b"\x28\xb5\x2f\xfd"
 
 
-def is_packed(fields: Any) -> bool:
-    """Return whether a CompressedImage is a raw one of `zstd_image_transport`."""
-    return str(fields.format).strip() == "zstd"
+def _raw_fields(fields: Any, where: str, *, compressed: bool) -> Any | None:
+    """Return the fields of a sensor_msgs/Image, also of one that `zstd_image_transport` packed; None:
+    they are those of an encoded picture.
+    """
+    if not compressed:
+        return fields
+    return _unpacked(fields, where) if str(fields.format).strip() == "zstd" else None
 
 
-def unpacked(fields: Any, where: str) -> Any:
+def _unpacked(fields: Any, where: str) -> Any:
     """Return the fields of a sensor_msgs/Image that `zstd_image_transport` packed.
 
     Its name is that of its later versions' compression; that of earlier ones is gzip.
@@ -91,11 +94,10 @@ def _decompressed(data: bytes) -> bytes:
 def band_of_message(fields: Any, where: str, *, compressed: bool) -> Band | None:
     """Return the band of levels of a 16-bit image; None: it has 8 bits, or is damaged."""
     try:
-        if compressed and is_packed(fields):
-            fields = unpacked(fields, where)
-        elif compressed:
+        raw = _raw_fields(fields, where, compressed=compressed)
+        if raw is None:
             return band_in(bytes(fields.data), where)
-        return band_of(raw_gray(fields, where)) if "16" in str(fields.encoding) else None
+        return band_of(raw_gray(raw, where)) if "16" in str(raw.encoding) else None
     except UnreadableImageError:
         return None  # the reader skips it and says so
 
