@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.calibration.severity import StereoError
-from vio.cameras.rig import Rectifier
 from vio.datasets.samples import motion_samples
 from vio.errors import DataError
 from vio.filters.stereo_calibration import VerticalDisparityModel
@@ -26,8 +25,9 @@ from vio.inspection.finding import Inspection, Part
 from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
 from vio.inspection.pictures import calibration_part, depths_part, images_part, rows_part
 from vio.monitor.inertial import InertialCheck
+from vio.monitor.reading import pair_as_read
 from vio.numerics.robust import robust_sigma
-from vio.protocols import Dataset, Frontend, RectifyingDataset
+from vio.protocols import Dataset, Frontend
 from vio.records import (
     NS_PER_S,
     ImuRecord,
@@ -81,10 +81,8 @@ def inspect_recording(
         if recording.camera.kind == "rgbd":
             parts.append(depths_part(frames))
         elif recording.camera.kind == "stereo":
-            stereo, off = rows_part(frames, _rectifier(dataset), progress)
-            parts.append(stereo)
-    if recording.has_images and recording.camera.kind == "stereo":
-        parts += _pairs_parts(dataset, frames_seen)
+            stereo, off = rows_part(frames, pair_as_read(dataset), progress)
+            parts += [stereo, *_pairs_parts(dataset, frames_seen)]
     parts += _motion_parts(dataset, span, times_ns)
     if recording.has_images and tracked > 1 and frames_seen:
         tracked = _frames_to_track(recording, times_ns, tracked)
@@ -95,13 +93,6 @@ def inspect_recording(
         parts.append(calibration_part(off))
     parts += [_reference_part(recording, times_ns), _missing_part(recording)]
     return Inspection(tuple(parts), recording.notes)
-
-
-def _rectifier(dataset: Dataset) -> Rectifier | None:
-    """Return what rectifies the images of a recording; None: they are as it has them."""
-    if not isinstance(dataset, RectifyingDataset) or dataset.rectifier.maps is None:
-        return None
-    return dataset.rectifier
 
 
 def _frames_to_track(recording: Recording, times_ns: IntArray, tracked: int) -> int:

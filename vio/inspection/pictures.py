@@ -12,9 +12,9 @@ from vio.calibration.findings import NotObservable
 from vio.calibration.readings import other_reading
 from vio.calibration.severity import StereoError
 from vio.calibration.stereo import RowResiduals, row_residuals
-from vio.cameras.rig import Rectifier
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
 from vio.inspection.finding import Part
 from vio.records import Image, StereoFrame
 
@@ -162,7 +162,7 @@ def depths_part(frames: Sequence[StereoFrame]) -> Part:
 
 def rows_part(
     frames: Sequence[StereoFrame],
-    rectifier: Rectifier | None,
+    pair: tuple[StereoRig, StereoCamera] | None,
     progress: Callable[[int, int], None],
 ) -> tuple[Part, StereoError | None]:
     """Describe how the rows of left and right images agree, by SIFT matches that assume nothing
@@ -170,7 +170,7 @@ def rows_part(
 
     Args:
         frames: of a recording.
-        rectifier: of raw images; None: they were rectified already.
+        pair: as read, and the camera that it is rectified to; None: the images were rectified already.
         progress: called with how many steps are done and how many there are.
     """
     matches = []
@@ -190,9 +190,9 @@ def rows_part(
             f"the right images are turned by about {turn_deg} degrees against the left ones: turn "
             "them back, or calibrate the pair with images as these"
         ]
-    if rectifier is not None and isinstance(rectifier.lenses, StereoRig):
-        reading = other_reading(rectifier.lenses, rectifier.camera, z)
-        faults = faults if reading is None else [str(reading)]
+    reading = None if pair is None else other_reading(*pair, z)
+    if reading is not None:
+        faults = [str(reading)]
     return Part("stereo", _rows_text(found, counts), _rows_facts(found), faults), off
 
 

@@ -12,6 +12,7 @@ from vio.findings import Finding
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.protocols import RectifyingDataset
 from vio.records import Observations
 
 _ROWS_OFF = ("stereo-calibration-off", "other-calibration")
@@ -26,6 +27,16 @@ class _FrameRules(NamedTuple):
 
 
 _FRAMES = _FrameRules()
+
+
+def pair_as_read(dataset: object) -> tuple[StereoRig, StereoCamera] | None:
+    """Return the raw pair of a recording and the camera that it is rectified to; None: its images
+    are rectified already, or those of one camera.
+    """
+    if not isinstance(dataset, RectifyingDataset) or dataset.rectifier.maps is None:
+        return None
+    lenses = dataset.rectifier.lenses
+    return (lenses, dataset.rectifier.camera) if isinstance(lenses, StereoRig) else None
 
 
 class ReadingCheck:

@@ -22,13 +22,12 @@ from vio.files.tables import Records
 from vio.filters.settings import VislamSettings
 from vio.findings import Finding
 from vio.frontend import one_opencv_thread
-from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import late_text, repaired
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, recorded_source
 from vio.live.processor import EventProcessor
-from vio.monitor.reading import ReadingCheck
+from vio.monitor.reading import ReadingCheck, pair_as_read
 from vio.monitor.run import RunMonitor
 from vio.numerics.threads import one_blas_thread
 from vio.protocols import Dataset, Detector, Frontend, RectifyingDataset, Viewer
@@ -268,7 +267,9 @@ def _process(what: _Run, delay: int) -> RunResult:
         taken = _taken_frames(dataset, config, start, stop)
         # these lack the images that come with later ones
         taken -= set(sorted(taken)[len(taken) - abs(state.delay) :])
-        loop = _Loop(state, recorder, shown, taken, reading_check(features))
+        pair = pair_as_read(features)
+        reading = None if pair is None else ReadingCheck(*pair)
+        loop = _Loop(state, recorder, shown, taken, reading)
         try:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
@@ -333,18 +334,6 @@ def given_rig(dataset: Dataset) -> Rig | None:
         dataset.imu_noise,
         made.time_offset_s,
     )
-
-
-def reading_check(dataset: object) -> ReadingCheck | None:
-    """Return what tries other readings of a pair's calibration; None: its images are rectified
-    already, or those of one camera.
-    """
-    if not isinstance(dataset, RectifyingDataset) or dataset.rectifier.maps is None:
-        return None
-    rectifier = dataset.rectifier
-    if not isinstance(rectifier.lenses, StereoRig):
-        return None
-    return ReadingCheck(rectifier.lenses, rectifier.camera)
 
 
 def _reopen_map(session: MapSession | None, use: MapUse | None) -> None:
