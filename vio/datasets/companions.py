@@ -45,8 +45,11 @@ from vio.records import (
 )
 
 IMU_FILES = ("imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv")
-_GYRO_NAMES = ("gyro", "gyr", "gyroscope")
-_ACCEL_NAMES = ("accel", "acc", "accelerometer")
+# of a gyro and an accelerometer that have a file each
+_GYRO_FILES = ("gyro.csv", "gyro.txt", "gyr.csv", "gyr.txt", "gyroscope.csv", "gyroscope.txt")
+_ACCEL_FILES = (
+    "accel.csv", "accel.txt", "acc.csv", "acc.txt", "accelerometer.csv", "accelerometer.txt",
+)  # fmt: skip
 _REFERENCES = (
     "reference.tum", "reference.txt", "groundtruth.tum", "groundtruth_tum.txt", "groundtruth.txt", "gt_imu.csv",
     "mocap0/data.csv", "state_groundtruth_estimate0/data.csv", "poses.txt",
@@ -267,17 +270,20 @@ def imu_files(*folders: Path) -> tuple[Path, ...]:
     """Return the table of the IMU in one of some folders, or those of a gyro and an accelerometer,
     in this order; none: there are none.
     """
+    if (imu := _first_file(folders, IMU_FILES)) is not None:
+        return (imu,)
     for folder in folders:
-        if found := [folder / name for name in IMU_FILES if (folder / name).is_file()]:
-            return (found[0],)
-    for folder in folders:
-        gyro, accel = (
-            next((f for name in names for f in sorted(folder.glob(f"{name}.[ct][sx][vt]"))), None)
-            for names in (_GYRO_NAMES, _ACCEL_NAMES)
-        )
+        gyro = _first_file([folder], _GYRO_FILES)
+        accel = _first_file([folder], _ACCEL_FILES)
         if gyro is not None and accel is not None:
             return gyro, accel
     return ()
+
+
+def _first_file(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
+    """Return the first file of some names, in the first folder that has one; None: there is none."""
+    files = (folder / name for folder in folders for name in names)
+    return next((file for file in files if file.is_file()), None)
 
 
 def _read_imu(files: Sequence[Path], notes: list[str]) -> tuple[ImuRecord, Sequence[str]]:

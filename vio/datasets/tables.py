@@ -325,9 +325,7 @@ def read_imu_table(
         times_ns = _times_ns(table.stamps, table.where, unit, increasing=False)
     else:
         times_ns = stamps_ns(table, SAMPLE_PACE, notes)
-    table, times_ns = _without_gaps(table, times_ns, notes)
-    table, times_ns = in_order(table, times_ns, notes)
-    values = _finite(table)
+    times_ns, values = _readings(table, times_ns, notes)
     order = _imu_order(table)
     if order is None:
         remedy = "exchange these columns with 5 to 7, or add a header such as 'timestamp [ns],ax,ay,az,wx,wy,wz'"
@@ -363,14 +361,26 @@ def read_sensor_table(
     """
     units, si = (GYRO_UNITS, "rad/s") if sensor == "gyro" else (ACCEL_UNITS, "m/s^2")
     table = read_table(path, 4, f"timestamp, {sensor} x y z [{si}]", notes)
-    times_ns = stamps_ns(table, SAMPLE_PACE, notes)
-    table, times_ns = _without_gaps(table, times_ns, notes)
-    table, times_ns = in_order(table, times_ns, notes)
+    times_ns, values = _readings(table, stamps_ns(table, SAMPLE_PACE, notes), notes)
     axes = [_sensor_and_axis(cell)[1] for cell in table.header[1:]]
     order = [axes.index(axis) for axis in "xyz"] if sorted(axes) == ["x", "y", "z"] else range(3)
     factor, said = _factor(table, order, units, sensor, si)
     notes += said
-    return times_ns, _finite(table)[:, order] * factor
+    return times_ns, values[:, order] * factor
+
+
+def _readings(
+    table: NumberTable, times_ns: IntArray, notes: list[str]
+) -> tuple[IntArray, FloatArray]:
+    """Return times (N,) and all other columns (N, K) of readings in the order of their times, without
+    those of which none is finite.
+
+    Raises:
+        DataError: of a line some are not, or the clock goes back.
+    """
+    table, times_ns = _without_gaps(table, times_ns, notes)
+    table, times_ns = in_order(table, times_ns, notes)
+    return times_ns, _finite(table)
 
 
 def _without_gaps(
