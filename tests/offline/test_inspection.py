@@ -8,7 +8,7 @@ import json
 import logging
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,16 +22,24 @@ from tests.commands import refused
 from tests.dataset_makers import FRAME_S, make_kitti
 from tests.frontend.test_frontend_scene import CAMERA
 from tests.guard.test_guard import shifted
+from tests.plain_maker import make_plain
 from vio.cli import main
 from vio.datasets import open_dataset
+from vio.datasets.image_pairs import ImageRecording
 from vio.frontend import build_frontend
 from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.geometry.lie import so3_exp
 from vio.guard.guarded import guarded
 from vio.inspection.inertial import allan_deviation, noise_part, rest_part
-from vio.inspection.inspect import _track, _tracking_parts, clock_facts, inspect_recording
+from vio.inspection.inspect import (
+    _pairs_parts,
+    _track,
+    _tracking_parts,
+    clock_facts,
+    inspect_recording,
+)
 from vio.inspection.pictures import GrayLevels, _image_faults
-from vio.records import ImuDensities, ImuRecord
+from vio.records import Event, ImuDensities, ImuRecord
 
 
 def inspect(
@@ -381,3 +389,22 @@ def test_names_images_that_are_white_or_flat(mean: float, spread: float) -> None
     image = np.zeros((4, 4), np.uint8)
     assert len(_image_faults([(image,)], [[GrayLevels(mean, spread, 0.0, 2.0)]])) == 1
     assert _image_faults([(image,)], [[GrayLevels(100.0, 3.2, 0.0, 2.0)]]) == []
+
+
+def test_windows_of_pairs_that_overlap_read_no_frame_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A short recording has fewer frames than the windows that are looked at."""
+    dataset = open_dataset(make_plain(tmp_path, 20))
+    read: list[int] = []
+    events = ImageRecording.events
+
+    def noted(
+        self: ImageRecording, start: int = 0, stop: int | None = None, **options: bool
+    ) -> Iterator[Event]:
+        read.extend(range(start, stop or 0))
+        return events(self, start, stop, **options)
+
+    monkeypatch.setattr(ImageRecording, "events", noted)
+    _pairs_parts(dataset, range(20))
+    assert sorted(read) == list(range(20))

@@ -162,13 +162,18 @@ def _pairs_parts(dataset: Dataset, of: range) -> list[Part]:
         return []
     last = _last_looked_at(dataset, of) + 1 - _LOOKED_AT.window_frames
     apart: dict[int, int] = {}
+    frames: list[StereoFrame] = []  # of a window; what the one before has of it is not read again
+    end = of[0]
     for first in np.linspace(of[0], last, _LOOKED_AT.windows).astype(int).tolist():
+        frames = [frame for frame in frames if frame.index >= first]
+        begin = max(first, end)
+        end = first + _LOOKED_AT.window_frames
         with contextlib.suppress(DataError):
-            events = dataset.events(first, first + _LOOKED_AT.window_frames)
-            frames = [event for event in events if isinstance(event, StereoFrame)]
-            delay = find_delay(frames, dataset.recording.camera)
-            if delay is not None:
-                apart[first] = delay
+            events = dataset.events(begin, end)
+            frames += [event for event in events if isinstance(event, StereoFrame)]
+        delay = find_delay(frames, dataset.recording.camera)
+        if delay is not None:
+            apart[first] = delay
     if len(set(apart.values())) < 2:  # of one delay throughout, tracking says more
         return []
     first, delay = next((first, delay) for first, delay in apart.items() if delay)
