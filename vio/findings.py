@@ -131,7 +131,7 @@ CODES: dict[str, Code] = {
     ),
     "right-camera-turned": Code(
         "degraded",
-        "the right camera has turned in its mount; what that does to disparities is taken out",
+        "the right camera is turned, or has turned, in its mount; that is taken out",
         "fix the mount of the right camera, and calibrate anew",
     ),
     "right-camera-shakes": Code(
@@ -152,8 +152,13 @@ CODES: dict[str, Code] = {
     ),
     "pairs-put-right": Code(
         "nominal",
-        "right images of another frame were found, and the run began again with the right ones",
+        "right images were of another frame, and the run began again with the right ones",
         _EXPOSURES,
+    ),
+    "right-turn-put-right": Code(
+        "nominal",
+        "the right camera is turned, and the run began again with its images turned back",
+        "calibrate anew",
     ),
     "gyro-jumped": Code(
         "degraded",

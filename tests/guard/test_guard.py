@@ -25,7 +25,7 @@ from vio.guard.guarded import GuardedFrontend, guarded
 from vio.guard.image_check import images_of
 from vio.guard.pairing import PairingCheck, find_delay, told_delay
 from vio.guard.probe import RowProbe
-from vio.guard.repairing import repaired
+from vio.guard.repairing import Repair, repaired
 from vio.records import (
     FrontendOutput,
     ImuSample,
@@ -325,7 +325,7 @@ def test_repaired_pairs_are_those_of_one_time_in_order(delay: int) -> None:
     events: list[StereoFrame | ImuSample] = []
     for frame in shifted(delay):
         events += [frame, replace(sample, time_ns=frame.time_ns + 1)]
-    out = list(repaired(events, delay))
+    out = list(repaired(events, Repair(delay), CAMERA))
     times = [event.time_ns for event in out]
     assert times == sorted(times)
     for event in out:

@@ -200,6 +200,22 @@ class CalibratedRig:
         """Standard deviations (14,) of the parameters."""
         return np.sqrt(np.diag(self.covariance))
 
+    def with_turned(self, rotation: FloatArray, given: Rig) -> CalibratedRig:
+        """Return the rig whose right camera is turned besides: by `rotation` (3,) rad in the
+        rectified frame of the given rig, by which images were turned back before anything was
+        estimated in them.
+
+        Parameters of turns add up to first order.
+        """
+        R_rect_cam1 = _Frame.of(given).R_rect_cam1
+        cam1, T_cam1_cam0 = self.rig.right
+        R = R_rect_cam1.T @ so3_exp(rotation) @ R_rect_cam1
+        T = se3_from_parts(R, np.zeros(3)) @ T_cam1_cam0
+        parameters = self.parameters.copy()
+        parameters[:3] += rotation
+        rig = replace(self.rig, cam1=cam1, T_cam1_cam0=T)
+        return replace(self, rig=rig, parameters=parameters)
+
     def lines(self) -> tuple[str, ...]:
         """Return one line for each parameter that is off by more than three standard deviations.
 

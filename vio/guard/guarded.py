@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from vio.findings import Finding
+from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.bands import BandRemoval
 from vio.guard.contrast import LostContrast
@@ -16,6 +17,7 @@ from vio.guard.object_matches import ObjectMatches
 from vio.guard.pairing import PairingCheck
 from vio.guard.probe import RowProbe
 from vio.guard.swap import SwapDetector
+from vio.guard.turned_pair import TurnedPair
 from vio.protocols import ChecksMatches, ChecksObjects, FollowsRight, Frontend
 from vio.records import (
     FrontendOutput,
@@ -34,7 +36,8 @@ def image_checks(camera: StereoCamera) -> tuple[ImageCheck, ...]:
     """Return the checks of the images of a camera, in their order.
 
     A frozen image looks as if it were the other camera's, so that is asked first. So do images of two
-    times, and are paired anew before they could be exchanged.
+    times, and are paired anew before they could be exchanged. All of these search along rows, which a
+    turned camera does not have.
     """
     if camera.kind != "stereo":
         return (LostContrast(),)
@@ -43,6 +46,7 @@ def image_checks(camera: StereoCamera) -> tuple[ImageCheck, ...]:
         BandRemoval(),
         LostContrast(),
         FrozenCamera(),
+        TurnedPair(camera, probe),
         SwapDetector(probe),
         PairingCheck(probe),
         ExchangeDetector(probe),
@@ -69,6 +73,14 @@ class GuardedFrontend:
         self._never = NeverMatched() if self._pair else None
         self._swap = next((c for c in self._checks if isinstance(c, SwapDetector)), None)
         self._exchange = next((c for c in self._checks if isinstance(c, ExchangeDetector)), None)
+        self._turned = next((c for c in self._checks if isinstance(c, TurnedPair)), None)
+
+    @property
+    def turned_back(self) -> FloatArray | None:
+        """The rotation (3,) rad of the right camera that is taken back in its images; None: none
+        is.
+        """
+        return None if self._turned is None else self._turned.rotation
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Check, and process what is left of a frame.
@@ -86,6 +98,8 @@ class GuardedFrontend:
             # before, few matches are a matter of the whole recording
             known = self._swap is not None and self._swap.decided
             self._exchange.suspicious = known and _few_matches(output.observations)
+        if self._turned is not None and images.right_usable:
+            self._turned.see(output.observations)
         found = tuple(f for check in self._checks for f in check.take_findings())
         return self._checked(output, found, prior, right_usable=images.right_usable)
 

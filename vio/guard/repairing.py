@@ -1,16 +1,85 @@
-"""A recording whose right images belong to the left images of other frames, paired anew."""
+"""A recording whose right images are wrong in the same way from its start, and put right when it is
+read: they belong to the left images of other frames, or are those of a turned camera.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
+
+from vio.dataclass import dataclass
+from vio.findings import Finding
+from vio.geometry.stereo import StereoCamera
 from vio.records import Event, Image, StereoFrame
 
 
-def repaired(events: Iterable[Event], delay: int) -> Iterator[Event]:
-    """Yield events with the images of each pair those of one time.
+@dataclass(frozen=True, slots=True)
+class Repair:
+    """What is put right of a recording's right images."""
+
+    delay: int = 0  # frames by which they are late; negative for early ones
+    # (3,) rad, by which their camera shows points p of its rectified frame as `exp(turn) p`
+    turn: tuple[float, ...] | None = None
+
+    def __bool__(self) -> bool:
+        return self.delay != 0 or self.turn is not None
+
+    def adding(self, finding: Finding) -> Repair:
+        """Return the repair of what a run found beside this one; itself where that is nothing new.
+
+        What was put right once is not put right again.
+        """
+        figures = finding.figures
+        if finding.code == "pairs-shifted" and self.delay == 0:
+            return replace(self, delay=round(figures["delay_frames"]))
+        if finding.code == "right-camera-turned" and self.turn is None and finding.since == 0:
+            angles = [figures[key] for axis in "xyz" if (key := f"turned_{axis}_deg") in figures]
+            if len(angles) == 3:
+                return replace(self, turn=tuple(np.radians(angles).tolist()))
+        return self
+
+    def to_json(self) -> dict[str, object] | None:
+        """Return it as plain values for `metrics.json`; None: nothing is put right."""
+        turn = None if self.turn is None else list(self.turn)
+        return {"late_frames": self.delay, "turned_rad": turn} if self else None
+
+    @classmethod
+    def of_json(cls, stated: Mapping[str, Any] | None) -> Repair:
+        """Return what `to_json` states."""
+        if stated is None:
+            return cls()
+        turn = stated.get("turned_rad")
+        return cls(stated.get("late_frames", 0), None if turn is None else tuple(turn))
+
+    def lines(self) -> tuple[tuple[str, str], ...]:
+        """Return codes, and a line for each, on what a run that began again has put right."""
+        out = []
+        if self.turn is not None:
+            angles = ", ".join(f"{angle:+.2f}" for angle in np.degrees(self.turn))
+            line = (
+                f"the right camera is turned against its calibration, by {angles} degrees about x, y "
+                "and z; the run began again with its images turned back; calibrate anew (vio "
+                "calibrate)"
+            )
+            out.append(("right-turn-put-right", line))
+        if self.delay:
+            line = (
+                f"{late_text(self.delay)}; the run began again with the right pairs; pair the images "
+                "by their times of exposure"
+            )
+            out.append(("pairs-put-right", line))
+        return tuple(out)
+
+
+AS_READ = Repair()  # nothing is put right
+
+
+def repaired(events: Iterable[Event], repair: Repair, camera: StereoCamera) -> Iterator[Event]:
+    """Yield events with the images of each pair those of one time, as calibrated.
 
     No image comes before its exposure: where right images are early, the left ones are late, and
     take the stamps of the frames that the right ones came with. The image that is late is taken from
@@ -18,9 +87,26 @@ def repaired(events: Iterable[Event], delay: int) -> Iterator[Event]:
 
     Args:
         events: as the recording gives them, in time order.
-        delay: frames by which right images are late; negative for early ones.
+        repair: what to put right.
+        camera: of the rectified images.
     """
-    return iter(events) if delay == 0 else _paired(events, abs(delay), right_is_late=delay > 0)
+    if repair.turn is not None:
+        events = _turned_back(events, repair.turn, camera)
+    if repair.delay:
+        events = _paired(events, abs(repair.delay), right_is_late=repair.delay > 0)
+    return iter(events)
+
+
+def _turned_back(
+    events: Iterable[Event], turn: tuple[float, ...], camera: StereoCamera
+) -> Iterator[Event]:
+    from vio.guard.turned_pair import turned_back  # loads OpenCV
+
+    rotation = np.array(turn)
+    for event in events:
+        if isinstance(event, StereoFrame) and event.right is not None:
+            event = replace(event, right=turned_back(event.right, camera, rotation))
+        yield event
 
 
 def late_text(delay: int) -> str:

@@ -240,7 +240,12 @@ class Odometry(EventInputs["Estimate | None"]):
             raise DataError(
                 "the rectified camera has no image size; give StereoCamera its width and height"
             )
-        return estimated_rig(rig, estimate, self.camera, "live images")
+        found = estimated_rig(rig, estimate, self.camera, "live images")
+        from vio.guard.guarded import GuardedFrontend  # loads OpenCV
+
+        frontend = self._processor.pipeline.frontend
+        turn = frontend.turned_back if isinstance(frontend, GuardedFrontend) else None
+        return found if turn is None else found.with_turned(turn, rig)
 
     @property
     def loops(self) -> tuple[LoopEvent, ...]:

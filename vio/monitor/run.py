@@ -15,6 +15,7 @@ from vio.errors import NOTE
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.guard.repairing import AS_READ
 from vio.imu.findings import ImuVerdict
 from vio.monitor.contradiction import ImuContradiction
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
@@ -83,10 +84,9 @@ class RunMonitor:
         self._scale_lines: list[Finding] = []  # not reported yet
         self.imu_verdict = ImuVerdict()  # by the findings so far
         self.findings: list[Finding] = []
-        # whether the run begins again where right images belong to other frames
-        self.ends_at_shifted_pairs = False
-        # frames by which right images were found to be late from the start; -1: early
-        self.pairs_shifted_by = 0
+        # whether the run begins again once more of its right images can be put right
+        self.ends_at_repair = False
+        self.repair = AS_READ  # of the recording's right images, by what was found so far
         self._integrity = IntegrityMonitor()
 
     def samples(self, samples: Iterable[MotionSample]) -> None:
@@ -376,10 +376,10 @@ class RunMonitor:
 
     def _add(self, findings: Iterable[Finding]) -> None:
         for finding in findings:
-            shifted = finding.code == "pairs-shifted"
-            if shifted:
-                self.pairs_shifted_by = round(finding.figures["delay_frames"])
-            if not (shifted and self.ends_at_shifted_pairs):
+            repair = self.repair.adding(finding)
+            ends = self.ends_at_repair and repair != self.repair
+            self.repair = repair
+            if not ends:
                 level = NOTE if is_corrected(finding) else logging.WARNING
                 log.log(level, "%s", finding.message)
             self.findings.append(finding)

@@ -20,6 +20,7 @@ from vio.geometry.distortion import rig_from_rectified
 from vio.geometry.lie import FloatArray
 from vio.geometry.rectify import pinhole_maps, pinhole_within
 from vio.geometry.stereo import StereoCamera
+from vio.guard.repairing import AS_READ, Repair, repaired
 from vio.protocols import Dataset
 from vio.records import FIELD_TERMS, ROW_TERMS, IntArray, StereoFrame
 from vio.runs.files import RunFile
@@ -35,6 +36,7 @@ class RunImages:
     camera: StereoCamera  # of the corrected images: a pinhole's, without the field
     # what the run found its stereo calibration to be off by; None: nothing
     field: DisplacementField | None
+    repair: Repair = AS_READ  # of the recording's right images
 
     def frames(
         self, indices: IntArray, source: str | None = None, *, colour: bool = False
@@ -53,7 +55,8 @@ class RunImages:
         """
         dataset = self._opened(source)
         correct = self._correction(dataset.recording.camera)
-        for frame in _chosen(in_colour(dataset) if colour else dataset, indices.tolist()):
+        shown = in_colour(dataset) if colour else dataset
+        for frame in _chosen(shown, indices.tolist(), self.repair):
             assert frame.left is not None
             if correct is None:
                 yield frame
@@ -118,12 +121,16 @@ def _spans(dataset: Dataset, indices: list[int]) -> list[tuple[int, int]]:
     return [(indices[0], indices[-1] + 1)] if indices else []
 
 
-def _chosen(dataset: Dataset, indices: list[int]) -> Iterator[StereoFrame]:
-    """Yield some frames: image files one by one, others, which are read in order, in one pass."""
+def _chosen(dataset: Dataset, indices: list[int], repair: Repair) -> Iterator[StereoFrame]:
+    """Yield some frames: image files one by one, others, which are read in order, in one pass.
+
+    Images that belong to those of other frames come with these.
+    """
     waiting = iter(indices)
     due = next(waiting, None)
     for start, stop in _spans(dataset, indices):
-        for event in dataset.events(start, stop):
+        events = dataset.events(start, stop + abs(repair.delay))
+        for event in repaired(events, repair, dataset.recording.camera):
             if isinstance(event, StereoFrame) and event.index == due and event.left is not None:
                 yield event
                 due = next(waiting, None)
@@ -155,7 +162,12 @@ def run_images(folder: Path, metrics: dict[str, Any]) -> RunImages:
         None if coefficients is None or seen.is_cylinder else DisplacementField(seen, coefficients)
     )
     return RunImages(
-        folder, source, seen, pinhole_within(seen) if seen.is_cylinder else seen, field
+        folder,
+        source,
+        seen,
+        pinhole_within(seen) if seen.is_cylinder else seen,
+        field,
+        Repair.of_json(metrics.get("right_images")),
     )
 
 

@@ -22,6 +22,7 @@ from vio.filters.tracks import measured
 from vio.geometry.lie import FloatArray, se3_inverse, so3_hat
 from vio.geometry.rectify import pinhole_pixels, pinhole_within
 from vio.geometry.stereo import StereoCamera
+from vio.guard.repairing import Repair
 from vio.offline.comparison import GroundTruth
 from vio.offline.keyframes import TrackedPath
 from vio.offline.run_images import RunImages, field_coefficients, original_source
@@ -57,6 +58,7 @@ class SavedRun:
             self.dataset.recording.camera,
             self.tracked.camera,
             self.field,
+            Repair.of_json(self.metrics.get("right_images")),
         )
 
     @property

@@ -413,6 +413,7 @@ def metrics_of(
         "findings": [finding.to_json() for finding in result.findings],
         "integrity": integrity_counts(result),
         "doubts": list(result.recording.doubts),
+        "right_images": result.repair.to_json(),
         "stereo_field": stereo_field(result),
         "stereo_scale": stereo_scale(result),
         "scale_sigma": final_scale_sigma(result),

@@ -24,7 +24,7 @@ from vio.findings import Finding
 from vio.frontend import one_opencv_thread
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
-from vio.guard.repairing import late_text, repaired
+from vio.guard.repairing import AS_READ, Repair, repaired
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, recorded_source
 from vio.live.processor import EventProcessor
 from vio.monitor.reading import ReadingCheck, pair_as_read
@@ -78,6 +78,7 @@ class RunResult:
     wall_s: float
     stopped: str | None = None  # why the run ended before the recording; None: it did not
     rig: Rig | None = None  # the calibration as given; None: features without an image size
+    repair: Repair = AS_READ  # what the run put right of the recording's right images
     mapped: MappedRun | None = None  # where a map was built or used
 
     def calibrated_rig(self) -> CalibratedRig | None:
@@ -93,7 +94,9 @@ class RunResult:
         if self.rig is None:
             return None
         recording = self.recording
-        return estimated_rig(self.rig, self.estimates[-1], recording.camera, str(recording.path))
+        found = estimated_rig(self.rig, self.estimates[-1], recording.camera, str(recording.path))
+        turn = self.repair.turn
+        return found if turn is None else found.with_turned(np.array(turn), self.rig)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -184,18 +187,20 @@ def run(
     _check_range(dataset.recording, start, stop)
     with contextlib.closing(Viewers(() if viewer is None else (viewer,))) as shown:
         what = _Run(dataset, config, start, stop, keep_observations, shown, parts, map, control)
-        try:
-            return what.process(0)
-        except _PairsShiftedError as found:
-            return what.process(found.delay)
+        repair = AS_READ
+        while True:  # each time something else is put right
+            try:
+                return what.process(repair)
+            except _BeginAgainError as found:
+                repair = found.repair
 
 
-class _PairsShiftedError(Exception):
-    """The first frames show that right images belong to the left images of other frames."""
+class _BeginAgainError(Exception):
+    """The first frames show what is wrong with all right images."""
 
-    def __init__(self, delay: int) -> None:
-        super().__init__(f"right images are late by {delay} frames")
-        self.delay = delay
+    def __init__(self, repair: Repair) -> None:
+        super().__init__(f"right images are put right: {repair}")
+        self.repair = repair
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,16 +222,16 @@ class _Run:
         """Whether all parts can be built anew, and nothing outside of the run has seen a frame."""
         return self.parts == CONFIGURED and self.map is None and not self.control.resume
 
-    def process(self, delay: int) -> RunResult:
-        """Process the recording, its right images late by `delay` frames."""
-        return _process(self, delay)
+    def process(self, repair: Repair) -> RunResult:
+        """Process the recording, its right images put right."""
+        return _process(self, repair)
 
 
-def _process(what: _Run, delay: int) -> RunResult:
+def _process(what: _Run, repair: Repair) -> RunResult:
     """Process a recording; see `run`.
 
     Raises:
-        _PairsShiftedError: the run is to begin again with right images paired anew.
+        _BeginAgainError: the run is to begin again with right images put right.
     """
     dataset = what.dataset
     config = what.config
@@ -238,7 +243,7 @@ def _process(what: _Run, delay: int) -> RunResult:
     control = what.control
     recording = dataset.recording
     folder = control.folder
-    source = replace(recorded_source(dataset, config), right_delay=delay)
+    source = replace(recorded_source(dataset, config), right_delay=repair.delay)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
     began = time.perf_counter()
     recorder = RunRecorder(
@@ -255,18 +260,20 @@ def _process(what: _Run, delay: int) -> RunResult:
             build_processor(source, config, parts, map),
             DeadReckoning(source.camera, source.T_cam0_body, config.vislam) if reckoned else None,
             start,
-            delay=delay,
+            repair=repair,
         )
     processor = state.processor
     monitor = processor.pipeline.monitor
-    if delay:
-        monitor.say(_paired_anew_line(delay), "pairs-put-right")
-    monitor.ends_at_shifted_pairs = what.can_begin_again and not delay
+    if not control.resume:
+        for code, line in repair.lines():
+            monitor.say(line, code)
+        monitor.repair = repair
+    monitor.ends_at_repair = what.can_begin_again
     stopped = None
     with contextlib.closing(recorder), contextlib.closing(processor):
         taken = _taken_frames(dataset, config, start, stop)
         # these lack the images that come with later ones
-        taken -= set(sorted(taken)[len(taken) - abs(state.delay) :])
+        taken -= set(sorted(taken)[len(taken) - abs(state.repair.delay) :])
         pair = pair_as_read(features)
         reading = None if pair is None else ReadingCheck(*pair)
         loop = _Loop(state, recorder, shown, taken, reading)
@@ -274,7 +281,7 @@ def _process(what: _Run, delay: int) -> RunResult:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
                 events = dataset.events(state.next_frame, stop, images=images)
-                events = repaired(events, state.delay)
+                events = repaired(events, state.repair, source.camera)
                 stopped = loop.run(events, features, control.should_stop)
         except VioError as error:
             if folder is None or not len(recorder):
@@ -300,6 +307,7 @@ def _process(what: _Run, delay: int) -> RunResult:
             wall_s=time.perf_counter() - began,
             stopped=stopped,
             rig=given_rig(dataset),
+            repair=state.repair,
             mapped=None if session is None else _mapped(session, recorder),
         )
 
@@ -370,7 +378,7 @@ class _RunState:
     # numbers of frames that the recording lists and did not give
     unread: list[int] = field(default_factory=list)
     sample_ns: int | None = None  # newest time of a motion sample that was taken
-    delay: int = 0  # frames by which the recording's right images are late
+    repair: Repair = AS_READ  # of the recording's right images
 
     def not_taken(self, events: Iterable[Event]) -> Iterator[Event]:
         """Yield the events of a recording that is read again which were not taken before."""
@@ -490,8 +498,8 @@ class _Loop:
 
     def _take_results(self, results: list[FrameResult]) -> None:
         monitor = self._state.processor.pipeline.monitor
-        if monitor.ends_at_shifted_pairs and monitor.pairs_shifted_by:
-            raise _PairsShiftedError(monitor.pairs_shifted_by)
+        if monitor.ends_at_repair and monitor.repair != self._state.repair:
+            raise _BeginAgainError(monitor.repair)
         for result in results:
             self._check_reading(result, monitor)
         if results:
@@ -513,14 +521,6 @@ class _Loop:
             self._viewer.frame(result)
         self._recorder.replace(state.processor.pipeline.take_revised())
         self._recorder.mark(state.processor.pipeline.monitor.take_marks())
-
-
-def _paired_anew_line(delay: int) -> str:
-    """Say that a run has begun again."""
-    return (
-        f"{late_text(delay)}; the run began again with the right pairs; pair the images by their "
-        "times of exposure"
-    )
 
 
 def _check_range(recording: Recording, start: int, stop: int | None) -> None:

@@ -116,6 +116,9 @@ _STEREO_FIELD = an_object(
     },
     or_null=True,
 )
+_RIGHT_IMAGES = an_object(
+    {"late_frames": WHOLE, "turned_rad": a_list(NUMBER, or_null=True)}, or_null=True
+)
 _SCALE = an_object({"percent": NUMBER, "sigma_percent": NUMBER}, "percent", "sigma_percent")
 _CAMERA_IMU = an_object(
     {
@@ -142,6 +145,7 @@ METRICS_SHAPE = an_object(
         **dict.fromkeys(("frames", "first_frame", "last_frame", "landmarks"), WHOLE),
         **dict.fromkeys(("innovation_ratio", "ate_m", "path_length_m"), NUMBER_OR_NULL),
         "warnings": a_list(TEXT, or_null=True),
+        "right_images": _RIGHT_IMAGES,
         "stereo_field": _STEREO_FIELD,
         "stereo_scale": an_object({}, each=_SCALE, or_null=True),
         "camera_imu": _CAMERA_IMU,

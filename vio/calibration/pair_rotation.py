@@ -1,0 +1,286 @@
+"""By how much the right camera of a rectified pair is turned against its calibration, by points
+that were matched without regard to rows.
+
+A rotation `exp(w)`, by which a right camera shows the points p of its rectified frame, moves all
+right pixels. About the axes x and z it moves rows by several pixels a tenth of a degree, whatever the
+depth: a single pair tells both. About y it moves rows by `x y w_y`, which a tangential distortion p2
+does as well, equation (R2) of docs/math.md, and all disparities by the same number of pixels: only
+motion tells it from depth. So the yaw comes from two pairs between which the rig has moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from vio.dataclass import dataclass
+from vio.geometry.lie import FloatArray, so3_exp
+from vio.geometry.stereo import StereoCamera
+from vio.numerics.robust import robust_sigma
+from vio.records import BoolArray
+
+
+class _Fit(NamedTuple):
+    """How rotations are fitted to pixels."""
+
+    # of Cauchy's weights, one for each iteration, so that outliers lose theirs step by step; a turn
+    # of 2 degrees moves rows by 60 px in the corner of a large image
+    widths_px: tuple[float, ...] = (60.0, 30.0, 15.0, 8.0, 4.0, 2.0, 1.0, 0.5, 0.5, 0.5)
+    near_px: float = 1.5  # rows of right matches differ by less after the fit
+    min_points: int = 30
+    sigma_px: float = 0.3  # of a pixel, at least
+    prior_rad: float = 3.0 * np.pi / 180.0  # standard deviation of each angle before
+    prior_p2: float = 2e-3  # of tangential distortion that a calibration leaves
+    # three of these: with more, outliers or points that move have led to another minimum
+    max_p2: float = 6e-3
+    step: float = 1e-6  # of numeric derivatives by angles, distortion, motion and points
+    iterations: int = 12
+    min_disparity_px: float = 0.5  # of points from which the motion starts
+    rounding: float = 1e-9  # share of normal equations below which they are none
+
+
+_FIT = _Fit()
+_SHARED = 10  # unknowns of two pairs: rotation, p2, and the motion's rotation and translation
+_PIXELS = 8  # of a point in two pairs
+
+
+@dataclass(frozen=True, slots=True)
+class PairRotation:
+    """A right camera that is turned against its calibration."""
+
+    rotation: FloatArray  # (3,) rad: it shows points p of its rectified frame as `exp(rotation) p`
+    covariance: FloatArray  # (3, 3) rad²
+    points: int  # that agree with it
+    share: float  # of all points
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations (3,) of the angles, rad."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def turned_pixels(camera: StereoCamera, rotation: FloatArray) -> FloatArray:
+    """Return the homography (3, 3) from pixels of a right camera as calibrated to those of one that
+    is turned by `rotation` (3,) rad.
+    """
+    K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
+    return np.asarray(K @ so3_exp(rotation) @ np.linalg.inv(K), dtype=np.float64)
+
+
+def rotation_by_rows(camera: StereoCamera, z: FloatArray) -> PairRotation | None:
+    """Return the rotation after which rows of left and right pixels agree; None: too few do.
+
+    The yaw is that of a right lens without tangential distortion.
+
+    Args:
+        camera: rectified pinholes.
+        z: (N, 4) matched pixels `[ul vl ur vr]`, wrong matches among them.
+    """
+    if len(z) < _FIT.min_points:
+        return None
+    rows = _normalised(camera, z)[:, 1]
+    rays = _rays(camera, z[:, 2:])
+
+    def off(w: FloatArray) -> FloatArray:
+        return camera.fv * (_undone(rays, w, 0.0)[:, 1] - rows)
+
+    prior: FloatArray = np.eye(3) / _FIT.prior_rad**2
+    w: FloatArray = np.zeros(3)
+    normal = prior
+    for width in _FIT.widths_px:
+        r = off(w)
+        J = np.stack([(off(w + step) - r) / _FIT.step for step in _FIT.step * np.eye(3)], axis=1)
+        weights = 1.0 / (1.0 + (r / width) ** 2)
+        sigma = max(_FIT.sigma_px, robust_sigma(r[np.abs(r) < 2 * width]))
+        normal = (J.T * weights) @ J / sigma**2 + prior
+        w = w - np.linalg.solve(normal, (J.T * weights) @ r / sigma**2 + prior @ w)
+    near = np.abs(off(w)) < _FIT.near_px
+    if near.sum() < _FIT.min_points:
+        return None
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    return PairRotation(w, covariance, int(near.sum()), float(near.mean()))
+
+
+def rotation_by_motion(
+    camera: StereoCamera, first: FloatArray, second: FloatArray, start: FloatArray
+) -> PairRotation | None:
+    """Return the rotation by the pixels of points in two pairs, by a bundle adjustment of motion
+    and points; None: too few points agree.
+
+    Its yaw is as uncertain as distortion p2 allows where the rig has not moved between the pairs.
+
+    Args:
+        camera: rectified pinholes.
+        first: (N, 4) pixels `[ul vl ur vr]` in one pair, wrong matches among them.
+        second: (N, 4) pixels of the same points in the other pair.
+        start: (3,) rotation by rows.
+    """
+    if len(first) < _FIT.min_points:
+        return None
+    seen = _SeenTwice(camera, first, second)
+    shared, near = _start(seen, start)
+    seen = seen.take(near)
+    try:
+        return _adjusted(seen, shared, len(first))
+    except np.linalg.LinAlgError:  # points without parallax, at the same place
+        return None
+
+
+def _adjusted(seen: _SeenTwice, shared: FloatArray, count: int) -> PairRotation | None:
+    """Return the rotation after a bundle adjustment from unknowns (10,) on; see
+    `rotation_by_motion`.
+    """
+    points = seen.points(shared[:3])
+    information = np.zeros(_SHARED)
+    information[:3] = 1.0 / _FIT.prior_rad**2
+    information[3] = 1.0 / _FIT.prior_p2**2
+    for _ in range(_FIT.iterations):
+        reduced, gradient, change = seen.equations(shared, points)
+        # without motion between the pairs all is determined but for rounding
+        reduced[np.diag_indices(_SHARED)] += information + _FIT.rounding * np.diag(reduced)
+        step = np.linalg.solve(reduced, -gradient - information * shared)
+        shared = shared + step
+        points = np.add(points, change(np.asarray(step, dtype=np.float64)))
+    r = seen.residuals(shared, points)
+    agree = np.abs(r).max(axis=1) < 4.0 * max(_FIT.sigma_px, robust_sigma(r))
+    if agree.sum() < _FIT.min_points or not abs(shared[3]) < _FIT.max_p2:
+        return None
+    covariance = np.asarray(np.linalg.inv(reduced)[:3, :3], dtype=np.float64)
+    return PairRotation(shared[:3], covariance, int(agree.sum()), float(agree.sum() / count))
+
+
+def _normalised(camera: StereoCamera, z: FloatArray) -> FloatArray:
+    """Return pixels (N, 4) in focal lengths from the principal point."""
+    centre = np.array([camera.cu, camera.cv, camera.cu, camera.cv])
+    focal = np.array([camera.fu, camera.fv, camera.fu, camera.fv])
+    return np.asarray((z - centre) / focal, dtype=np.float64)
+
+
+def _rays(camera: StereoCamera, pixels: FloatArray) -> FloatArray:
+    """Return rays (N, 3) of unit depth of pixels (N, 2)."""
+    x = _normalised(camera, np.hstack([pixels, pixels]))[:, :2]
+    return np.hstack([x, np.ones((len(x), 1))])
+
+
+def _undone(rays: FloatArray, rotation: FloatArray, p2: float) -> FloatArray:
+    """Return where a right camera as calibrated shows rays (N, 3) of one that is turned and has
+    tangential distortion p2: (N, 2), focal lengths.
+    """
+    x = rays[:, 0]
+    y = rays[:, 1]
+    bent = rays.copy()
+    bent[:, 0] -= p2 * (3 * x * x + y * y)
+    bent[:, 1] -= p2 * 2 * x * y
+    turned = bent @ so3_exp(rotation)
+    return np.asarray(turned[:, :2] / turned[:, 2:], dtype=np.float64)
+
+
+class _SeenTwice:
+    """Points in two pairs, and what their pixels say of the rotation.
+
+    A point is the place (u, v) at which the left camera shows it in the first pair, and its inverse
+    depth in baselines, d, all in focal lengths.
+    """
+
+    def __init__(self, camera: StereoCamera, first: FloatArray, second: FloatArray) -> None:
+        self._camera = camera
+        self._pixels = (first, second)
+        self._left = tuple(_normalised(camera, z)[:, :2] for z in (first, second))
+        self._rays = tuple(_rays(camera, z[:, 2:]) for z in (first, second))
+
+    def take(self, rows: BoolArray) -> _SeenTwice:
+        """Return some of the points, by a mask (N,)."""
+        first, second = self._pixels
+        return _SeenTwice(self._camera, first[rows], second[rows])
+
+    def points(self, rotation: FloatArray) -> FloatArray:
+        """Return the points (N, 3) by the first pair."""
+        left = self._left[0]
+        right = _undone(self._rays[0], rotation, 0.0)
+        row = 0.5 * (left[:, 1] + right[:, 1])
+        return np.stack([left[:, 0], row, left[:, 0] - right[:, 0]], axis=1)
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length, pixels."""
+        return self._camera.fu
+
+    @property
+    def later(self) -> FloatArray:
+        """Where the left camera shows the points in the second pair (N, 2), focal lengths."""
+        return self._left[1]
+
+    def residuals(self, shared: FloatArray, points: FloatArray) -> FloatArray:
+        """Return residuals (N, 8), pixels, of unknowns (10,) and points (N, 3)."""
+        rotation = shared[:3]
+        p2 = float(shared[3])
+        u, v, d = points.T
+        ones = np.ones_like(u)
+        moved = np.stack([u, v, ones], axis=1) @ so3_exp(shared[4:7]).T + d[:, None] * shared[7:10]
+        depth = moved[:, 2:]
+        off = [
+            self._left[0] - points[:, :2],
+            _undone(self._rays[0], rotation, p2) - np.stack([u - d, v], axis=1),
+            self._left[1] - moved[:, :2] / depth,
+            _undone(self._rays[1], rotation, p2)
+            - (moved[:, :2] - np.stack([d, 0 * d], axis=1)) / depth,
+        ]
+        return self._camera.fu * np.concatenate(off, axis=1)
+
+    def equations(
+        self, shared: FloatArray, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Callable[[FloatArray], FloatArray]]:
+        """Return the normal equations (10, 10) and gradient (10,) of the shared unknowns, the
+        points eliminated, and the change (N, 3) of the points for a step (10,) of these.
+        """
+        r = self.residuals(shared, points)
+        sigma = max(_FIT.sigma_px, robust_sigma(r))
+        h = _FIT.step
+        A = np.stack(
+            [(self.residuals(shared + h * e, points) - r) / h for e in np.eye(_SHARED)], axis=2
+        )
+        B = np.stack([(self.residuals(shared, points + h * e) - r) / h for e in np.eye(3)], axis=2)
+        squared = (r * r).sum(axis=1) / (_PIXELS * sigma**2)
+        weights = 1.0 / (1.0 + squared) / sigma**2
+        Aw = A * weights[:, None, None]
+        Bw = B * weights[:, None, None]
+        V = np.linalg.inv(np.einsum("nki,nkj->nij", Bw, B) + _FIT.rounding * np.eye(3))
+        W = np.einsum("nki,nkj->nij", Aw, B)
+        g = np.einsum("nki,nk->ni", Bw, r)
+        WV = W @ V
+        reduced = np.einsum("nki,nkj->ij", Aw, A) - np.einsum("nij,nkj->ik", WV, W)
+        gradient = np.einsum("nki,nk->i", Aw, r) - np.einsum("nij,nj->i", WV, g)
+
+        def change(step: FloatArray) -> FloatArray:
+            back = g + np.einsum("nij,i->nj", W, step)
+            return np.asarray(-np.einsum("nij,nj->ni", V, back), dtype=np.float64)
+
+        return reduced, gradient, change
+
+
+def _start(seen: _SeenTwice, rotation: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the unknowns (10,) to start at, and the points (N,) that agree with that motion.
+
+    The motion is that of the left camera by the points of the first pair.
+    """
+    import cv2
+
+    focal = seen.focal_px
+    points = seen.points(rotation)
+    d = np.maximum(points[:, 2], _FIT.min_disparity_px / focal)
+    p = np.stack([points[:, 0], points[:, 1], np.ones(len(d))], axis=1) / d[:, None]
+    shared = np.zeros(_SHARED)
+    shared[:3] = rotation
+    cv2.setRNGSeed(0)
+    known, turn, shift, rows = cv2.solvePnPRansac(
+        p, seen.later, np.eye(3), None, reprojectionError=_FIT.widths_px[4] / focal
+    )
+    if not known or rows is None or len(rows) < _FIT.min_points:
+        return shared, np.ones(len(d), dtype=np.bool_)
+    shared[4:7] = turn.ravel()
+    shared[7:] = shift.ravel()
+    near = np.zeros(len(d), dtype=np.bool_)
+    near[rows.ravel()] = True
+    return shared, near
