@@ -90,12 +90,17 @@ def _turn_right_camera(folder: Path, w_deg: list[float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("w_deg", "where"),
-    [([2.0, 0.0, 0.0], "a camera has been turned"), ([0.0, 2.0, 0.0], "unusable: rows off by")],
+    ("w_deg", "where", "in_run"),
+    [
+        ([2.0, 0.0, 0.0], "a camera has been turned", "the right camera is turned"),
+        # near points, and no motion yet, from which the yaw is told
+        ([0.0, 2.0, 0.0], "unusable: rows off by", "the stereo calibration is off"),
+    ],
 )
 def test_a_turned_right_camera_is_named_before_and_in_the_run(
     w_deg: list[float],
     where: str,
+    in_run: str,
     flight: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -123,8 +128,29 @@ def test_a_turned_right_camera_is_named_before_and_in_the_run(
         )
         == 0
     )
-    named = [line for line in caplog.messages if "the stereo calibration is off" in line]
+    named = [line for line in caplog.messages if in_run in line]
     assert len(named) == 1
+
+
+def test_a_turned_right_camera_is_calibrated_with_features_tracked_along_its_rows(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "turned"
+    shutil.copytree(flight, folder)
+    _turn_right_camera(folder, [0.3, 0.0, 1.2])
+    out = tmp_path / "found"
+    assert main(["calibrate", str(folder), "--out", str(out), "--pairs", "8", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert [finding["fault"] for finding in facts["findings"]] == ["left-right rotation wrong"]
+    x, _, z = map(float, re.findall(r"[-+]\d\.\d\d", facts["findings"][0]["detail"]))
+    assert (x, z) == (pytest.approx(0.3, abs=0.03), pytest.approx(1.2, abs=0.03))
+    assert facts["rows"]["rms_px"] > 1.0, "that of the calibration as given"
+    found = str(out / "camchain-imucam.yaml")
+    command = ["run", str(folder), "--calibration", found, "--motion", "none", "--stop", "12"]
+    assert main([*command, "--quiet", "--json", "--out", str(tmp_path / "out")]) == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["right_images"] is None
+    assert metrics["stereo_field"]["rows_rms_px"] < 0.2
 
 
 def test_inspection_and_run_state_one_figure_of_a_calibration_that_is_off(

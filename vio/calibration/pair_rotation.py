@@ -45,6 +45,9 @@ _FIT = _Fit()
 # Of a rotation. Calibrations of real recordings have at most 0.06 about x and z, and 0.2 about y: four
 # of the standard deviations that the filter takes for it (`msckf.stereo_yaw_sigma_deg`).
 MIN_TURN_DEG = 0.2
+# of one about y by rows alone: a right lens whose tangential distortion is off looks like 0.6 degrees
+# in all rows of KITTI
+MIN_ROW_YAW_DEG = 0.9
 _SHARED = 10  # unknowns of two pairs: rotation, p2, and the motion's rotation and translation
 _PIXELS = 8  # of a point in two pairs
 
@@ -62,6 +65,14 @@ class PairRotation:
     def sigmas(self) -> FloatArray:
         """Standard deviations (3,) of the angles, rad."""
         return np.sqrt(np.diag(self.covariance))
+
+
+def is_turned_by_rows(turn_deg: FloatArray) -> bool:
+    """Whether a rotation (3,) by rows, degrees about x, y and z, is more than that of a usual
+    calibration; rows tell yaw badly.
+    """
+    x, y, z = np.abs(turn_deg).tolist()
+    return bool(max(x, z) >= MIN_TURN_DEG or y >= MIN_ROW_YAW_DEG)
 
 
 def turned_pixels(camera: StereoCamera, rotation: FloatArray) -> FloatArray:

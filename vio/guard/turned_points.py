@@ -15,8 +15,10 @@ import cv2
 import numpy as np
 
 from vio.calibration.pair_rotation import (
+    MIN_ROW_YAW_DEG,
     MIN_TURN_DEG,
     PairRotation,
+    is_turned_by_rows,
     rotation_by_motion,
     rotation_by_rows,
 )
@@ -34,9 +36,6 @@ class _PointRules(NamedTuple):
     ratio: float = 0.75  # of the distances of nearest and second descriptor, Lowe (2004)
     # of SIFT's matches that agree with a rotation; true pairs have 0.85 and more
     min_share: float = 0.75
-    # of a rotation about y by rows alone: a right lens whose tangential distortion is off looks like
-    # 0.6 degrees in all rows of KITTI
-    min_row_yaw_deg: float = 0.9
     pairs: int = 6  # that tell the rotation
     alike_deg: float = 0.1  # rotations of pairs differ by less …
     alike_sigmas: float = 4.0  # … and so many standard deviations
@@ -77,7 +76,9 @@ class TurnedPoints:
         """
         pair = _Pair(*OpenCvExtractor("sift", _POINTS.keypoints)(*images))
         found = self._by_rows(pair.left, pair.right)
-        if found is None or not (self._rows_may_agree or _is_turned_by_rows(found)):
+        if found is None or not (
+            self._rows_may_agree or is_turned_by_rows(np.degrees(found.rotation))
+        ):
             return False
         self._pairs.append(pair)
         self._rows.append(found)
@@ -116,7 +117,7 @@ class TurnedPoints:
     def _rotation_by_rows(self) -> PairRotation:
         """Return the rotation by the rows of all pairs; no yaw where a lens may be what they show."""
         mean = np.mean([found.rotation for found in self._rows], axis=0)
-        if abs(mean[1]) < np.radians(_POINTS.min_row_yaw_deg):
+        if abs(mean[1]) < np.radians(MIN_ROW_YAW_DEG):
             mean[1] = 0.0
         return replace(self._rows[-1], rotation=mean)
 
@@ -142,7 +143,11 @@ class TurnedPoints:
         for before in self._pairs[-1 - _POINTS.max_delay : -1]:
             for left, right in ((before.left, now.right), (now.left, before.right)):
                 found = self._by_rows(left, right)
-                if found is not None and found.points > least and not _is_turned_by_rows(found):
+                if (
+                    found is not None
+                    and found.points > least
+                    and not is_turned_by_rows(np.degrees(found.rotation))
+                ):
                     return True
         return False
 
@@ -155,12 +160,6 @@ def _right_pixels(pair: _Pair) -> FloatArray:
     out = np.full((len(pair.left), 2), np.nan)
     out[rows] = pair.right.pixels[others]
     return out
-
-
-def _is_turned_by_rows(found: PairRotation) -> bool:
-    """Whether a rotation by rows is more than that of a usual calibration; they tell yaw badly."""
-    x, y, z = np.abs(np.degrees(found.rotation)).tolist()
-    return bool(max(x, z) >= MIN_TURN_DEG or y >= _POINTS.min_row_yaw_deg)
 
 
 def _is_constant(found: list[PairRotation]) -> bool:

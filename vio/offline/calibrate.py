@@ -17,6 +17,7 @@ from vio.calibration.gyro import align_gyro
 from vio.calibration.inertial import ImuAlignment, rates_of
 from vio.calibration.intrinsics import Intrinsics, judge_intrinsics
 from vio.calibration.lever_arm import LeverArm, estimate_lever_arm
+from vio.calibration.pair_rotation import is_turned_by_rows
 from vio.calibration.severity import StereoError
 from vio.calibration.stereo import (
     RayMatches,
@@ -39,7 +40,7 @@ from vio.datasets.image_pairs import gray_levels
 from vio.datasets.images import load_gray
 from vio.errors import EstimationError
 from vio.geometry.distortion import StereoRig, unproject_pixel
-from vio.geometry.lie import FloatArray, so3_log
+from vio.geometry.lie import FloatArray, se3_from_parts, so3_log
 from vio.geometry.rectify import rectify_pixels
 from vio.geometry.stereo import StereoCamera, left_rays
 from vio.offline.colmap.pairs import adjust_rig, relative_pose, sift_matches
@@ -75,6 +76,7 @@ class _RoundRules(NamedTuple):
     settled_deg: float = 0.05
     # a frame of a feature file contains fewer matches than a pair of images
     frames_per_pair: int = 5
+    max_turn_deg: float = 15.0  # with a larger one, extrinsics are those of another rig
     # with larger row differences, features are matched wrongly or not at all
     max_row_offset_px: float = 2.0
 
@@ -86,6 +88,9 @@ _ROWS = "row alignment"
 _IMU = "IMU-camera rotation and time offset"
 _LEVER_ARM = "lever arm"
 _INTRINSICS = "focal length and principal point"
+_NOT_TURNED = NotObservable(
+    _INTRINSICS, "the right camera is turned: measure again with the calibration found here"
+)
 _NOT_TRACKED = NotObservable(_INTRINSICS, "no features were tracked")
 
 
@@ -110,6 +115,8 @@ class CalibrationReport:
     notes: tuple[str, ...]
     intrinsics: Intrinsics | NotObservable = _NOT_TRACKED
     in_motion: SelfCalibration | None = None  # by bundle adjustment; None: from single pairs alone
+    # with the right camera as matches show it, where it is turned far: `in_motion` is beside that
+    measured_again: bool = False
 
     @property
     def stereo_error(self) -> StereoError | None:
@@ -117,8 +124,10 @@ class CalibrationReport:
         if not isinstance(self.rows, RowResiduals):
             return None
         seen_px = self.rows.disparity_px
-        if self.in_motion is None or self.source.dataset is None or seen_px <= 0:
+        known = self.in_motion is not None and not self.measured_again
+        if not known or self.source.dataset is None or seen_px <= 0:
             return StereoError(self.rows.rms_px, seen_px)
+        assert self.in_motion is not None
         off, sigma = self.in_motion.disparity_off(self.source.dataset.recording.camera, seen_px)
         return StereoError(self.rows.rms_px, seen_px, off, sigma)
 
@@ -156,6 +165,23 @@ def _judge_exchange_or_stereo(
     if not findings and isinstance(stereo, StereoEstimate):
         findings = judge_stereo(stereo, given, agreeing)
     return findings
+
+
+def _again(
+    source: CalibrationSource, stereo: StereoEstimate | NotObservable, findings: tuple[Finding, ...]
+) -> CalibrationSource | None:
+    """Return the data with the right camera as measured, where it is turned too far for features
+    to be tracked; None: it is not, or nothing is known of it.
+    """
+    if not isinstance(stereo, StereoEstimate) or any(f.fault in _UNUSABLE for f in findings):
+        return None
+    given = source.T_cam0_cam1
+    turn_deg = np.degrees(so3_log(stereo.R_cam1_cam0 @ given[:3, :3]))
+    if not is_turned_by_rows(turn_deg) or np.linalg.norm(turn_deg) > _ROUND.max_turn_deg:
+        return None
+    R = stereo.R_cam1_cam0
+    # its place is that given: the direction of a short baseline is measured badly
+    return source.with_right(se3_from_parts(R, -R @ given[:3, 3]))
 
 
 def _fault_of_rows(rows: RowResiduals | NotObservable, findings: tuple[Finding, ...]) -> str | None:
@@ -205,6 +231,20 @@ def measure(
         return CalibrationReport(source, stereo, rows, _no_imu(why), findings, notes)
     described = row_residuals(matches.z, *source.image_size(matches.z))
     fault = _fault_of_rows(described, findings)
+    if again := _again(source, stereo, findings):
+        # features are tracked along rows that agree; what the given calibration is off by, is told
+        # by the matches that need no rows
+        report = measure(again, build_frontend, pairs=pairs, frames=frames, progress=progress)
+        if report.in_motion is not None and isinstance(report.stereo, StereoEstimate):
+            findings = judge_stereo(report.stereo, given, agreeing)
+        return replace(
+            report,
+            rows=described,
+            stereo_findings=findings,
+            notes=notes,
+            intrinsics=_NOT_TURNED,
+            measured_again=True,
+        )
     if fault is not None:
         why = f"{fault}: correct that first, then measure again"
         return CalibrationReport(source, stereo, described, _no_imu(why), findings, notes)

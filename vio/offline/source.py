@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from vio.cameras.rig import Rig
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.euroc_files import read_camera_yaml
 from vio.datasets.features import FeatureDataset
 from vio.datasets.image_pairs import ImageDataset, pair_images
+from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError
 from vio.geometry.distortion import StereoRig, rig_from_rectified
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.rectify import rectifying_rotations
 from vio.protocols import Dataset, Frontend
 from vio.records import (
@@ -57,6 +60,20 @@ class CalibrationSource:
             return None
         return rectifying_rotations(self.dataset.rectifier.rig)[:2]
 
+    def with_right(self, T_cam1_cam0: FloatArray) -> CalibrationSource | None:
+        """Return the data with another pose (4, 4) of the right camera; None: they are no image
+        files that can be rectified.
+        """
+        if self.rig is None or not self.raw_pairs or self.dataset is None:
+            return None
+        recording = self.dataset.recording
+        T_cam0_imu = se3_inverse(self.rig.T_imu_cam0)
+        rig = Rig(self.rig.cam0, self.rig.cam1, T_cam1_cam0, T_cam0_imu)
+        with TemporaryDirectory() as folder:
+            file = Path(folder, "camchain.yaml")
+            file.write_text(kalibr_text(rig), encoding="utf-8")
+            return open_source(f"{recording.kind}:{recording.path}", file)
+
     def image_size(self, z: FloatArray) -> tuple[float, float]:
         """Return width and height in pixels; where unknown, the extent of rectified pixels (N,
         4).
@@ -67,15 +84,19 @@ class CalibrationSource:
         return (float(z[:, 0].max()) + 1, float(z[:, 1].max()) + 1) if len(z) else (1.0, 1.0)
 
 
-def open_source(text: str) -> CalibrationSource:
-    """Open a recording with its calibration unchanged, even if it cannot be rectified with it.
+def open_source(text: str, calibration: Path | None = None) -> CalibrationSource:
+    """Open a recording with its calibration unchanged, or that of a file, even if it cannot be
+    rectified with it.
 
     Raises:
         DataError: no known recording, or it cannot be read.
         CalibrationError: the calibration is invalid, and the recording is not in EuRoC format.
     """
     try:
-        dataset = open_dataset(text, DatasetSettings(extrinsics="literal", projection="pinhole"))
+        settings = DatasetSettings(
+            extrinsics="literal", projection="pinhole", calibration=calibration
+        )
+        dataset = open_dataset(text, settings)
     except CalibrationError as error:
         found = _raw_euroc(Path(text.removeprefix("euroc:")), str(error))
         if found is None:
