@@ -15,6 +15,7 @@ from vio.frontend.right_delay import PairingCounts, at_exposure, at_present
 from vio.frontend.right_images import RightImages
 from vio.frontend.right_turn import PairShake, RightTurn
 from vio.frontend.stereo_fit import StereoFit
+from vio.frontend.stereo_match import ROW_SEARCH, shifted_rows
 from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -37,6 +38,8 @@ class RightMatcher:
         self._delay = self.images.delay
         self._turn = RightTurn(camera.fu)
         self._shake = PairShake(camera.fu)
+        # by which the rows of the last contradicting frame match best, pixels at half resolution
+        self._rows_off = 0
 
     def take_findings(self) -> tuple[Finding, ...]:
         """Return what was found since the last call."""
@@ -161,13 +164,23 @@ class RightMatcher:
     ) -> PairingCounts:
         """Count the features that match if the right image belongs to this frame, the one
         before, or the next one.
+
+        A camera that has turned shows all rows off by the same from then on: what the rows of the
+        last such frame were off by counts for this one as well.
         """
         assert previous.right_half is not None
         before = previous.tracks.left[_rows_by_slot(previous.tracks, tracks)][:_PAIRING_POINTS]
         now = tracks.left[:_PAIRING_POINTS]
+        offsets = range(-ROW_SEARCH.max_rows_half, ROW_SEARCH.max_rows_half + 1)
+        same = {
+            rows: stereo.count_on_rows(left.half, shifted_rows(right.half, rows), now)
+            for rows in offsets
+        }
+        near = range(self._rows_off - 1, self._rows_off + 2)
+        self._rows_off = max(offsets, key=lambda rows: same[rows])
         return PairingCounts(
             points=len(now),
-            same=stereo.count_on_rows(left.half, right.half, now),
+            same=max(same[rows] for rows in (0, *near) if rows in same),
             late=stereo.count_on_rows(previous.left.half, right.half, before),
             early=stereo.count_on_rows(left.half, previous.right_half, now),
         )

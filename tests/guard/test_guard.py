@@ -16,6 +16,7 @@ from tests.frontend.test_frontend_scene import CAMERA, flight, stereo_frame
 from tests.guards import codes
 from tools.faults.cameras import Wall, moving_object
 from tools.faults.changes import Changed, Period
+from vio.calibration.pair_rotation import turned_pixels
 from vio.findings import CODES
 from vio.frontend import build_frontend
 from vio.frontend.precomputed import PrecomputedFrontend
@@ -255,6 +256,32 @@ def test_a_pitched_right_camera_is_none_of_another_time(rows: int) -> None:
     """Among these is what the images move by in a frame, so that those of another frame match."""
     pitched = [replace(pair, right=np.roll(pair.right, rows, axis=0)) for pair in frames()]
     assert find_delay(pitched, CAMERA) in (0, None)
+
+
+def _turned_later(rotation_deg: list[float]) -> list[StereoFrame]:
+    """Frames whose right camera turns in its mount in the first frame of the fault."""
+    H = turned_pixels(CAMERA, np.radians(rotation_deg))
+    out = []
+    for frame in frames():
+        assert frame.right is not None
+        right = cv2.warpPerspective(frame.right, H, frame.right.shape[::-1])
+        later = replace(frame, right=np.asarray(right, dtype=np.uint8))
+        out.append(later if frame.index >= FAULT.start else frame)
+    return out
+
+
+@pytest.mark.parametrize(
+    "rotation_deg",
+    [
+        *([pitch, 0.0, 0.0] for pitch in (-1.2, -0.8, -0.4, 0.4, 0.8, 1.2)),
+        *([0.0, yaw, 0.0] for yaw in (3.5, 4.5)),  # disparities of 15 px are negative
+    ],
+)
+def test_a_right_camera_that_turns_is_neither_late_nor_exchanged(rotation_deg: list[float]) -> None:
+    """The rows are off by what the images move by in a frame, or disparities are negative."""
+    frontend = guarded(build_frontend("klt", CAMERA, SETTINGS), CAMERA)
+    found = codes([frontend.process(frame) for frame in _turned_later(rotation_deg)])
+    assert set(found) == {"right-contradicts-left"}
 
 
 def test_pairs_of_a_rig_at_standstill_are_not_judged() -> None:

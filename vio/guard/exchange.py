@@ -4,7 +4,8 @@ each other then.
 Each image is compared with both of the last frame. The camera's motion shifts both images alike, so
 they differ from their own last images by about the same; from the other camera's last image, one
 differs by motion plus disparity and the other by motion minus disparity. Where it is the other way
-round, matches decide: exchanged images match with negative disparities only.
+round, matches decide: exchanged images match with negative disparities only. So do those of a right
+camera that has turned, but its left image is like the last one of the left camera.
 """
 
 from __future__ import annotations
@@ -40,6 +41,9 @@ class _ExchangeRules:
     # share of them above which a frame that looks exchanged is refused: its rows do not fit when
     # put back
     refused_share: float = 0.2
+    # change of a left image since the left camera's last one, over that since the right one's, at
+    # most, of one that is not exchanged; exchanged ones have 0.9 and more
+    own_share: float = 0.8
 
 
 _EXCHANGE = _ExchangeRules()
@@ -63,6 +67,8 @@ class ExchangeDetector(ImageCheck):
         # left and right, sparsely sampled, in their right order
         self._last: tuple[Image, Image] | None = None
         self._since: int | None = None  # first frame of a run of exchanged ones
+        # disparities are negative, and were so in a frame whose left image was the left camera's
+        self._right_turned = False
         # the matches of the last frame contradicted each other, so matches are counted in any case
         self.suspicious = False
 
@@ -125,6 +131,11 @@ class ExchangeDetector(ImageCheck):
             or (self._last is not None and self._looks_exchanged(now))
         ):
             order = _judge(count(), "given" if self._since is None else "exchanged")
+            self._right_turned = order != "given" and (
+                self._right_turned or self._left_is_left(now)
+            )
+            if self._right_turned:
+                order = "given"
         if order != "refused":
             self._last = now if order == "given" else now[::-1]
         self._report(index, order)
@@ -137,6 +148,15 @@ class ExchangeDetector(ImageCheck):
         # The motion shifts both images alike; or it shifts them by less than the disparity does.
         unlike = abs(own[0] - own[1]) > abs(other[0] - other[1])
         return unlike or sum(own) > sum(other)
+
+    def _left_is_left(self, now: tuple[Image, Image]) -> bool:
+        """Whether the left image is clearly the next one of the left camera: then disparities are
+        negative as the right camera has turned.
+        """
+        if self._last is None:
+            return False
+        own, other = (image_change(now[0], last) for last in self._last)
+        return own < _EXCHANGE.own_share * other
 
     def _report(self, index: int, order: Order) -> None:
         if order == "given":
