@@ -22,6 +22,8 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray, SigmaArray, TrackPrior
 
 _NEARLY_ALL = 0.9  # of the matches without an offset, that one with it may have
+# tried row differences, pixels at half resolution
+_ROW_OFFSETS = range(-ROW_SEARCH.max_rows_half, ROW_SEARCH.max_rows_half + 1)
 _PAIRING_POINTS = 150  # features that are tried with images of other frames
 
 
@@ -38,8 +40,8 @@ class RightMatcher:
         self._delay = self.images.delay
         self._turn = RightTurn(camera.fu)
         self._shake = PairShake(camera.fu)
-        # by which the rows of the last contradicting frame match best, pixels at half resolution
-        self._rows_off = 0
+        # by which the rows of the first contradicting frame match best, pixels at half resolution
+        self._rows_off: int | None = None
 
     def take_findings(self) -> tuple[Finding, ...]:
         """Return what was found since the last call."""
@@ -103,6 +105,7 @@ class RightMatcher:
                 stereo.restart_rows()
                 return no_tracks()
             return tracks
+        self._rows_off = None
         seen = matched.has_right
         rows = matched.right[seen, 1] - matched.left[seen, 1] - delay * flow[seen, 1]
         if self._delay.update(frame.index, matched.left[seen], flow[seen], rows, frame_s):
@@ -166,21 +169,22 @@ class RightMatcher:
         before, or the next one.
 
         A camera that has turned shows all rows off by the same from then on: what the rows of the
-        last such frame were off by counts for this one as well.
+        first such frame were off by counts for the next ones as well.
         """
         assert previous.right_half is not None
         before = previous.tracks.left[_rows_by_slot(previous.tracks, tracks)][:_PAIRING_POINTS]
         now = tracks.left[:_PAIRING_POINTS]
-        offsets = range(-ROW_SEARCH.max_rows_half, ROW_SEARCH.max_rows_half + 1)
+        first = self._rows_off is None
+        offsets = _ROW_OFFSETS if self._rows_off is None else {0, self._rows_off}
         same = {
             rows: stereo.count_on_rows(left.half, shifted_rows(right.half, rows), now)
             for rows in offsets
         }
-        near = range(self._rows_off - 1, self._rows_off + 2)
-        self._rows_off = max(offsets, key=lambda rows: same[rows])
+        if first:
+            self._rows_off = max(offsets, key=lambda rows: same[rows])
         return PairingCounts(
             points=len(now),
-            same=max(same[rows] for rows in (0, *near) if rows in same),
+            same=same[0] if first else max(same.values()),
             late=stereo.count_on_rows(previous.left.half, right.half, before),
             early=stereo.count_on_rows(left.half, previous.right_half, now),
         )
