@@ -45,6 +45,15 @@ def test_a_lasting_finding_holds_until_it_has_ended() -> None:
     assert judge(monitor, range(30, 31))[0].integrity == "nominal"
 
 
+def test_an_event_does_not_end_what_lasts() -> None:
+    """A spike of the accelerometer while the gyro is stuck, both of one code."""
+    monitor = IntegrityMonitor()
+    monitor.take(Finding("imu-readings", "", 0, lasts=True))
+    judge(monitor, range(2))
+    monitor.take(Finding("imu-readings", "", 2))
+    assert {e.integrity for e in judge(monitor, range(2, 30))} == {"degraded"}
+
+
 def test_an_event_without_an_end_counts_for_a_second() -> None:
     monitor = IntegrityMonitor()
     monitor.take(Finding("estimate-restarted", "", 0))

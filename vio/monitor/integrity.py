@@ -154,7 +154,10 @@ class IntegrityMonitor:
             if CODES[finding.code].effect == "nominal":
                 continue
             until_ns = None if finding.lasts else now_ns + _HOLDS_NS
-            self._holding[finding.code] = _Holding(finding, until_ns)
+            held = self._holding.get(finding.code)
+            # an event of a second does not end one of the same code that lasts
+            if held is None or held.until_ns is not None or finding.lasts:
+                self._holding[finding.code] = _Holding(finding, until_ns)
             since = finding.first_frame
             if since is not None and since < index:
                 self._marks.append(Mark(since, index, finding.effect, finding.code))

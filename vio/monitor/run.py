@@ -103,7 +103,7 @@ class RunMonitor:
         taken = 0
         for k, gap in self._silence.samples([x.time_ns for x in new]):
             self._check(new[taken:k])  # what is to be said of earlier samples comes first
-            self._report("imu-gap", [gap])
+            self._add([gap])
             taken = k
         self._check(new[taken:])
 
@@ -160,9 +160,9 @@ class RunMonitor:
         self._features += len(seen)
         self._seen = seen
         if self._silence is not None:
-            self._report("imu-gap", self._silence.frame(seen.frame_index, seen.time_ns))
+            self._add(self._silence.frame(seen.frame_index, seen.time_ns))
         if self._faults is not None:
-            self._faults.frame(seen.frame_index)
+            self._faults.frame(seen.frame_index, seen.time_ns)
         if self._repeated:
             return
         self._frozen.observations(seen)
@@ -322,13 +322,13 @@ class RunMonitor:
         self._report("frames-repeated", self._repeats.finish())
         self._report("depths-repeated", self._depths.finish())
         if self._silence is not None:
-            self._report("imu-gap", self._silence.finish())
+            self._add(self._silence.finish())
         if self._faults is not None:
             self._add(self._faults.finish())
         if self._inertial is not None:
             findings = self._inertial.finish()
             # which is no matter of clocks
-            if self._faults is not None and self._faults.stuck_at_end:
+            if self._faults is not None and self._faults.is_stuck:
                 findings = tuple(f for f in findings if f.group != "overlap")
             self._report_findings(findings)
         self._report_scale(last=True)
