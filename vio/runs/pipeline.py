@@ -27,8 +27,6 @@ from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import late_text, repaired
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, recorded_source
 from vio.live.processor import EventProcessor
-from vio.monitor.reading import ReadingCheck, pair_as_read
-from vio.monitor.run import RunMonitor
 from vio.numerics.threads import one_blas_thread
 from vio.protocols import Dataset, Detector, Frontend, RectifyingDataset, Viewer
 from vio.records import (
@@ -267,9 +265,7 @@ def _process(what: _Run, delay: int) -> RunResult:
         taken = _taken_frames(dataset, config, start, stop)
         # these lack the images that come with later ones
         taken -= set(sorted(taken)[len(taken) - abs(state.delay) :])
-        pair = pair_as_read(features)
-        reading = None if pair is None else ReadingCheck(*pair)
-        loop = _Loop(state, recorder, shown, taken, reading)
+        loop = _Loop(state, recorder, shown, taken)
         try:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
@@ -412,7 +408,6 @@ class _Loop:
         recorder: RunRecorder,
         viewer: Viewer,
         frames: set[int],
-        reading: ReadingCheck | None,
     ) -> None:
         """Prepare.
 
@@ -421,10 +416,8 @@ class _Loop:
             recorder: takes the results.
             viewer: watches each frame.
             frames: numbers of the recording's frames that the run is to take.
-            reading: tries other readings of the calibration; None: it is of rectified images.
         """
         self._state = state
-        self._reading = reading
         self._recorder = recorder
         self._viewer = viewer
         self._frames = frames
@@ -492,16 +485,8 @@ class _Loop:
         monitor = self._state.processor.pipeline.monitor
         if monitor.ends_at_shifted_pairs and monitor.pairs_shifted_by:
             raise _PairsShiftedError(monitor.pairs_shifted_by)
-        for result in results:
-            self._check_reading(result, monitor)
         if results:
             self._record(results)
-
-    def _check_reading(self, result: FrameResult, monitor: RunMonitor) -> None:
-        if self._reading is not None:
-            found = self._reading.frame(result.output.observations, monitor.findings)
-            if found is not None:
-                monitor.add(found)
 
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state
