@@ -77,6 +77,9 @@ class RunResult:
     stopped: str | None = None  # why the run ended before the recording; None: it did not
     rig: Rig | None = None  # the calibration as given; None: features without an image size
     mapped: MappedRun | None = None  # where a map was built or used
+    # standard deviation that motion sensor and field of disparities add to what the settings state
+    # of the scale, over it
+    scale_doubt: float = 0.0
 
     def calibrated_rig(self) -> CalibratedRig | None:
         """Return the calibration with what the run found it to be off by; None: features without an
@@ -297,6 +300,7 @@ def _process(what: _Run, delay: int) -> RunResult:
             stopped=stopped,
             rig=given_rig(dataset),
             mapped=None if session is None else _mapped(session, recorder),
+            scale_doubt=recorder.scale_doubt,
         )
 
 
