@@ -128,7 +128,8 @@ class RunMonitor:
         self._take_new()
         repeated = self._frozen.check(frame, expected)
         self._repeated = repeated is not None
-        self._report("frames-repeated", self._repeats.frame(frame, repeated))
+        named = repeated if repeated is not None and repeated.certain else None
+        self._report("frames-repeated", self._repeats.frame(frame, named))
         return self._repeated
 
     def without_repeated_depth(self, frame: StereoFrame) -> StereoFrame:
