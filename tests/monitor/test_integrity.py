@@ -61,6 +61,29 @@ def test_an_event_without_an_end_counts_for_a_second() -> None:
     assert states == ["degraded"] * 10 + ["nominal"] * 5
 
 
+def test_innovations_beyond_what_is_stated_inflate_the_covariance() -> None:
+    """The errors are larger by as much, and where the rig is stays unknown when they are not."""
+    monitor = IntegrityMonitor()
+
+    def sigmas_m(ratios: list[float]) -> list[float]:
+        sigmas = []
+        for ratio in ratios:
+            monitor.take_innovation(ratio)
+            (judged,) = judge(monitor, range(1))
+            assert judged.integrity == "nominal"
+            sigmas.append(float(np.sqrt(judged.covariance[0, 0])))
+        return sigmas
+
+    stated_m = float(np.sqrt(estimate(0).covariance[0, 0]))
+    usual = [1.0, 2.0, 1.5, 30.0, 1.2, 1.0, 0.8]  # with a shock
+    np.testing.assert_array_equal(sigmas_m(usual), stated_m)
+    found = sigmas_m([6.0] * 5 + [1.0] * 10)
+    assert found[4] == pytest.approx(3.0 * stated_m)
+    assert found[-1] == found[4]
+    monitor.forget_innovations()
+    assert sigmas_m([1.0]) == [stated_m]
+
+
 def test_information_leaves_an_estimate_nominal() -> None:
     monitor = IntegrityMonitor()
     monitor.take(Finding("stereo-calibration-off", "", 0))

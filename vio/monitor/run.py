@@ -241,6 +241,7 @@ class RunMonitor:
         self._report("imu-not-used", [line])
         if self._contradiction is not None:
             self._add(self._contradiction.end(index))
+            self._integrity.forget_innovations()
 
     def waiting(self, frame: StereoFrame, why: str) -> None:
         """Add a frame without a pose, as the back end's start is not observable yet; `why` is
@@ -292,6 +293,7 @@ class RunMonitor:
         self._add(self._health.frame(index, report, estimate))
         if self._contradiction is not None:
             self._add(self._contradiction.frame(index, report.innovation_ratio))
+            self._integrity.take_innovation(report.innovation_ratio)
         if report.gyro_jump_radps is not None and self._inertial is not None:
             self._inertial.begin_after_jump()
         self._integrity.take_scale_doubt(index, report.scale_doubt)
