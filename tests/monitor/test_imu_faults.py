@@ -254,21 +254,21 @@ def test_a_clean_imu_gives_no_line() -> None:
         (
             _zeros,
             [
-                "frame 30: the IMU reads zero in all axes since 1505000000 ns",
+                "frame 31: the IMU reads zero in all axes since 1505000000 ns",
                 "the IMU gives new readings again, after 0.99 s of zeros",
             ],
         ),
         (
             _stuck,
             [
-                "frame 30: the IMU repeats one reading to the last bit since 1500000000 ns",
+                "frame 31: the IMU repeats one reading to the last bit since 1500000000 ns",
                 "the IMU gives new readings again, after 1.00 s of one reading",
             ],
         ),
         (
             _dead_gyro,
             [
-                "frame 35: the gyro reads zero in all axes since 1505000000 ns",
+                "frame 36: the gyro reads zero in all axes since 1505000000 ns",
                 "the gyro gives new readings again, after 0.99 s of zeros",
             ],
         ),
@@ -291,19 +291,20 @@ def test_an_imu_that_is_stuck_to_the_end_is_reported() -> None:
 def test_an_imu_that_is_stuck_is_found_while_it_is_and_holds_from_its_first_frame() -> None:
     monitor = _monitored(_faulty(_stuck))
     begun, ended = monitor.findings
-    assert begun.frame == 30  # the last one that was given, exposed at 1.5 s as the reading is
-    assert begun.first_frame == 30
+    assert begun.frame == 31  # exposed at 1.55 s; the reading is of 1.5 s
+    assert begun.first_frame == 31
     assert begun.lasts
     assert ended.ended
-    assert ended.frame == 49
+    assert ended.frame == 50
 
 
 def test_zeros_from_the_start_are_found() -> None:
     """Not even gravity is read, so no usual readings are needed to compare them with."""
     zero = np.zeros(3)
     monitor = _monitored(_faulty(lambda k, x, last: replace(x, gyro=zero, accel=zero)))
-    assert monitor.findings[0].code == "imu-readings"
-    assert monitor.findings[0].frame == 0
+    (finding,) = monitor.findings  # no word of clocks
+    assert finding.code == "imu-readings"
+    assert finding.first_frame == 1
 
 
 def test_samples_that_are_missing_for_seconds_are_no_matter_of_clocks() -> None:

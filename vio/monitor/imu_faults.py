@@ -35,8 +35,9 @@ class _FrameTimes:
         self._frames: deque[tuple[int, int]] = deque(maxlen=_RECENT)
 
     def add(self, index: int, time_ns: int) -> None:
-        """Add a frame in order of time."""
-        self._frames.append((index, time_ns))
+        """Add a frame in order of time, once or twice."""
+        if not self._frames or self._frames[-1][0] != index:
+            self._frames.append((index, time_ns))
 
     def first_after(self, time_ns: int) -> int | None:
         """Return the number of the first frame after a time; None: there is none yet."""
@@ -56,7 +57,9 @@ class ImuFaultReport:
         self._spikes: dict[ImuFaultKind, list[ImuFault]] = {}
 
     def frame(self, index: int, time_ns: int) -> None:
-        """Take the number and stamp of a frame, for the lines that follow."""
+        """Take the number and stamp of a frame before the samples up to it, for their lines; again
+        is no harm.
+        """
         self._frame = index
         self._frames.add(index, time_ns)
 
