@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,26 +63,28 @@ def test_an_event_without_an_end_counts_for_a_second() -> None:
 
 
 def test_innovations_beyond_what_is_stated_inflate_the_covariance() -> None:
-    """The errors are larger by as much, and where the rig is stays unknown when they are not."""
+    """What it grows by meanwhile is larger by as much, until measurements make it known again."""
     monitor = IntegrityMonitor()
 
-    def sigmas_m(ratios: list[float]) -> list[float]:
-        sigmas = []
-        for ratio in ratios:
+    def variances(ratio: float, stated: list[float]) -> list[float]:
+        found = []
+        for k, variance in enumerate(stated):
             monitor.take_innovation(ratio)
-            (judged,) = judge(monitor, range(1))
+            given = replace(estimate(k), covariance=variance * np.eye(6))
+            judged = monitor.judged(k, given)
             assert judged.integrity == "nominal"
-            sigmas.append(float(np.sqrt(judged.covariance[0, 0])))
-        return sigmas
+            found.append(float(judged.covariance[0, 0]))
+        return found
 
-    stated_m = float(np.sqrt(estimate(0).covariance[0, 0]))
-    usual = [1.0, 2.0, 1.5, 30.0, 1.2, 1.0, 0.8]  # with a shock
-    np.testing.assert_array_equal(sigmas_m(usual), stated_m)
-    found = sigmas_m([6.0] * 5 + [1.0] * 10)
-    assert found[4] == pytest.approx(3.0 * stated_m)
-    assert found[-1] == found[4]
+    usual = [1e-4, 2e-4, 1e-4, 2e-4, 3e-4]
+    assert variances(2.0, usual) == usual
+    assert variances(30.0, [4e-4]) == [4e-4]  # a shock
+    assert variances(1.0, 5 * [4e-4]) == 5 * [4e-4]
+    assert variances(6.0, [4e-4, 4e-4, 4e-4, 4e-4, 5e-4])[-1] == pytest.approx(5e-4 + 8e-4)
+    assert variances(1.0, 6 * [5e-4])[-1] == pytest.approx(5e-4 + 8e-4)
+    assert variances(1.0, [2.5e-4])[-1] == pytest.approx(2.5e-4 + 4e-4)
     monitor.forget_innovations()
-    assert sigmas_m([1.0]) == [stated_m]
+    assert variances(1.0, [2.5e-4]) == [2.5e-4]
 
 
 def test_information_leaves_an_estimate_nominal() -> None:

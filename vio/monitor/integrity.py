@@ -7,8 +7,8 @@ says of the motion since then may be wrong by all of it. When the fault has ende
 known again, and the position is not: what the covariance covered stays in it.
 
 Where features lie further from their predictions by the IMU than the filter expects, frame after
-frame, its errors are larger by as much as far as anyone can say, whatever the cause is: the
-covariance covers that from the first frames on, long before a cause is found.
+frame, its new errors are larger by as much as far as anyone can say, whatever the cause is: what the
+covariance grows by is, too, long before a cause is found.
 """
 
 from __future__ import annotations
@@ -80,6 +80,9 @@ class IntegrityMonitor:
         # innovations over their standard deviations by a motion sensor
         self._ratios = deque[float](maxlen=_INNOVATION.frames)
         self._misled_m = 0.0  # what the position may be off by more than stated, as they say
+        self._largest = (
+            0.0  # variance of the position in any direction, as stated at the last frame
+        )
         # frames and the level of the scale's doubt that their covariances have from there on: less
         # in each than in the one before
         self._scale_doubts: list[tuple[int, int]] = []
@@ -173,14 +176,18 @@ class IntegrityMonitor:
 
     def _measure_misled(self, covariance: FloatArray) -> None:
         """Bring what innovations say of the position's errors to the present frame, of a stated
-        covariance (6, 6).
+        covariance (6, 6): its growth is larger by as much, and what it has lost is known again.
         """
-        if len(self._ratios) < _INNOVATION.frames:
+        if not self._ratios:
             return
-        factor = median(np.array(self._ratios)) / _INNOVATION.usual
-        if factor > 1.0:
-            largest = float(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-            self._misled_m = max(self._misled_m, float(np.sqrt((factor**2 - 1.0) * largest)))
+        before = self._largest
+        self._largest = largest = float(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+        if largest <= before:
+            self._misled_m *= float(np.sqrt(largest / before)) if before > 0.0 else 1.0
+        elif len(self._ratios) == _INNOVATION.frames:
+            factor = max(median(np.array(self._ratios)) / _INNOVATION.usual, 1.0)
+            more = (factor**2 - 1.0) * (largest - before)
+            self._misled_m = float(np.sqrt(self._misled_m**2 + more))
 
     def _onset_ns(self, finding: Finding, now_ns: int) -> int:
         """The time of the first frame that a finding holds for."""
