@@ -21,6 +21,7 @@ from vio.filters.imu_gaps import ImuHistory
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
+from vio.findings import Finding
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log
 from vio.imu.settings import DEFAULT_IMU, ImuSettings
 from vio.live.processor import Due, EventOrder
@@ -296,6 +297,10 @@ def test_a_gap_longer_than_the_memory_hides_what_the_signal_did_before_it() -> N
 
 
 def _lines(times_s: list[float], frames_s: list[float]) -> list[str]:
+    return [finding.message for finding in _findings(times_s, frames_s)]
+
+
+def _findings(times_s: list[float], frames_s: list[float]) -> list[Finding]:
     monitor = RunMonitor(CAMERA, T_CAM0_IMU, imu=True)
     flight, rng = Flight(), np.random.default_rng(0)
     events: list[Event] = [_sample(round(1e9 * t)) for t in times_s]
@@ -308,7 +313,7 @@ def _lines(times_s: list[float], frames_s: list[float]) -> list[str]:
         else:
             monitor.samples([event])
     monitor.close()
-    return [line for line in monitor.lines if line.startswith(("frame", "no IMU"))]
+    return [f for f in monitor.findings if f.message.startswith(("frame", "no IMU"))]
 
 
 FRAMES_S = [0.05 * k for k in range(100)]
@@ -326,28 +331,45 @@ def test_a_clean_imu_is_not_talked_of() -> None:
 @pytest.mark.parametrize("length_s", [0.12, 0.4, 1.0, 3.0])
 def test_every_gap_is_told_once_with_its_length(length_s: float) -> None:
     lines = _lines(_imu_s((1.0, 1.0 + length_s), (4.2, 4.4)), FRAMES_S)
-    assert len(lines) == 2
-    assert f"no IMU sample for {length_s:.2f} s from 1000000000 ns; carried by images" in lines[0]
-    assert "no IMU sample for 0.20 s from 4200000000 ns" in lines[1]
+    first, second = (line for line in lines if "no IMU sample for" in line)
+    assert f"no IMU sample for {length_s:.2f} s from 1000000000 ns; carried by images" in first
+    assert "no IMU sample for 0.20 s from 4200000000 ns" in second
+
+
+def test_a_gap_is_found_while_it_lasts_and_holds_from_its_first_frame_to_its_last() -> None:
+    begun, ended = _findings(_imu_s((1.0, 3.0)), FRAMES_S)
+    assert begun.frame == 23  # 0.1 s is no gap
+    assert begun.first_frame == 21
+    assert begun.lasts
+    assert ended.ended
+    assert ended.frame is not None
+    assert 57 <= ended.frame <= 60
 
 
 def test_an_imu_that_ends_early_is_told() -> None:
-    lines = _lines(_imu_s((3.0, 99.0)), FRAMES_S)
-    assert lines == [
+    begun, last = _findings(_imu_s((3.0, 99.0)), FRAMES_S)
+    assert begun.frame == 63
+    assert begun.first_frame == 61
+    assert begun.lasts
+    assert last.message == (
         "frame 99: no IMU sample for 1.95 s from 3000000000 ns to the end of the run; carried by "
         "images"
-    ]
+    )
 
 
 def test_an_imu_that_begins_late_or_never_is_told() -> None:
-    lines = _lines(_imu_s((-1.0, 2.02)), FRAMES_S)
-    (line,) = lines
-    assert line.startswith(
+    begun, ended = _findings(_imu_s((-1.0, 2.02)), FRAMES_S)
+    assert begun.message.startswith("frame 3: no IMU sample yet, 0.15 s after frame 0")
+    assert begun.first_frame == 0
+    assert begun.lasts
+    assert ended.ended
+    assert ended.message.startswith(
         "frame 39: the first IMU sample came 2.02 s after frame 0; until then 39 frames were "
         "carried by"
     )
-    lines = _lines([], FRAMES_S)
-    assert lines == ["no IMU sample in any of 100 frames: all were carried by images alone"]
+    begun, last = _findings([], FRAMES_S)
+    assert begun.lasts
+    assert last.message == "no IMU sample in any of 100 frames: all were carried by images alone"
 
 
 def test_frames_wait_for_an_imu_that_begins_late() -> None:

@@ -112,8 +112,8 @@ def test_equal_images_that_end_with_a_jump_were_given_again(
         assert frozen.check(_frame(k, left, right), None) is None
         frozen.observations(observations(k, k * STEP_NS, ids, Z + px))
 
-    for k in range(3):
-        take(k, 0.1 * k)
+    for k, px in enumerate([0.0, 0.15, 0.2]):
+        take(k, px)
     for k in range(3, 9):
         take(k, 0.2)
         assert frozen.take_held() is None
@@ -130,6 +130,27 @@ def test_what_moved_up_to_the_frame_before_has_not_stopped_at_once() -> None:
         frozen.observations(observations(k, k * STEP_NS, IDS, Z + 2.0 * k))
     repeated = frozen.check(_frame(3, _shifted(LEFT, 4.0), _shifted(RIGHT, 4.0)), None)
     assert repeated == Repeated(2, exact=True)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "left_out"),
+    [([0.0, 0.1, 0.2], 2), ([0.0, 0.05, 0.2], 2), ([0.0, 0.15, 0.2], 0), ([0.2, 0.2, 0.2], 0)],
+    ids=["creeps", "begins to move", "slows down", "stands still"],
+)
+def test_the_first_equal_frames_of_a_rig_that_creeps_are_left_out(
+    pixels: list[float], left_out: int
+) -> None:
+    """By images alone it may have stopped: nothing is said, and after two frames it has."""
+    frozen = FrozenImages()
+    for k, px in enumerate(pixels):
+        frozen.check(_frame(k, _shifted(LEFT, px), _shifted(RIGHT, px)), None)
+        frozen.observations(observations(k, k * STEP_NS, IDS, Z + px))
+    found = []
+    for k in range(3, 8):
+        left = _shifted(LEFT, pixels[-1])
+        right = _shifted(RIGHT, pixels[-1])
+        found.append(frozen.check(_frame(k, left, right), None))
+    assert found == left_out * [Repeated(2, True, certain=False)] + (5 - left_out) * [None]
 
 
 def test_a_bit_equal_pair_is_a_repetition_where_the_imu_moves() -> None:

@@ -113,6 +113,26 @@ def test_live_events_give_the_poses_of_the_recorded_run(
     assert odometry.warnings == recorded.warnings
 
 
+def test_a_calibration_of_other_images_is_named_live_from_the_first_frame_on(
+    recording: SimulatedRecording, rig: Rig
+) -> None:
+    """The images are rectified, and the lenses that are given are those of raw ones."""
+    assert rig.cam1 is not None
+    bend = (-0.28, 0.07, 0.0, 0.0)
+    bent = [replace(c, model="radtan", coefficients=bend) for c in (rig.cam0, rig.cam1)]
+    read = replace(rig, cam0=bent[0], cam1=bent[1], T_cam0_imu=None)
+    with Odometry(read, IMAGES_ALONE) as odometry:
+        for event in recording.events(0, 15):
+            if isinstance(event, StereoFrame):
+                assert event.left is not None
+                assert event.right is not None
+                odometry.add_stereo(event.time_ns, event.left, event.right)
+        found = next(f for f in odometry.findings if f.code == "calibration-misread")
+    assert found.first_frame == 0
+    assert odometry.estimate is not None
+    assert odometry.estimate.integrity == "unusable"
+
+
 def _fly(odometry: Odometry, frames: int = 30, first: int = 0) -> list[Estimate]:
     """Feed features and IMU samples of a flight."""
     flight, noise = Flight(frames=frames + 1), np.random.default_rng(3)

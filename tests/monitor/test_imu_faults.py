@@ -86,7 +86,7 @@ def _passed(samples: list[ImuSample]) -> tuple[list[int], list[str]]:
     """Numbers of the samples that pass, and the kinds of the faults."""
     check = ImuSampleCheck()
     usable = [u.time_ns // 5_000_000 for x in samples for u in check.take_all([x])]
-    return usable, [f.kind for f in check.finish()]
+    return usable, [f.kind for f in check.new_faults()]
 
 
 def _samples(values: FloatArray) -> list[ImuSample]:
@@ -104,7 +104,7 @@ def _noise(count: int, scale: float = 0.01) -> FloatArray:
 def test_clean_samples_pass_at_once() -> None:
     check = ImuSampleCheck()
     assert all(check.take_all([x]) == [x] for x in _samples(_noise(1000)))
-    assert check.finish() == ()
+    assert check.new_faults() == ()
 
 
 def test_a_real_step_and_a_real_shock_pass() -> None:
@@ -142,7 +142,7 @@ def test_readings_at_the_end_of_the_range_are_left_out_from_the_fifth_on() -> No
     batches = [samples[k : k + 37] for k in range(0, 1600, 37)]
     together = [u.time_ns // 5_000_000 for batch in batches for u in check.take_all(batch)]
     assert together == passed
-    assert {fault.size for fault in check.finish()} == {0.7}
+    assert {fault.size for fault in check.new_faults()} == {0.7}
 
 
 def test_a_range_that_is_exceeded_was_none() -> None:
@@ -206,7 +206,11 @@ def test_a_reading_given_twice_is_not_a_second_measurement_but_no_fault_either()
 
 
 def _lines(samples: list[ImuSample]) -> list[str]:
-    """All lines of a run monitor, with the flight's features at every tenth sample."""
+    return _monitored(samples).lines
+
+
+def _monitored(samples: list[ImuSample]) -> RunMonitor:
+    """A run monitor at the end, with the flight's features at every tenth sample."""
     monitor, flight = RunMonitor(CAMERA, T_CAM0_IMU, imu=True), Flight(FRAMES)
     rng = np.random.default_rng(0)
     events: list[Event] = [
@@ -220,7 +224,7 @@ def _lines(samples: list[ImuSample]) -> list[str]:
         if due.frame is not None:
             monitor.observations(flight.observe(due.frame.index, 0.1, rng))
     monitor.close()
-    return monitor.lines
+    return monitor
 
 
 def _faulty(change: Change) -> list[ImuSample]:
@@ -247,9 +251,27 @@ def test_a_clean_imu_gives_no_line() -> None:
                 "3 of",
             ],
         ),
-        (_zeros, ["the IMU read zero in all axes for 0.99 s from 1505000000 ns"]),
-        (_stuck, ["the IMU repeated one reading to the last bit for 1.00 s from 1500000000 ns"]),
-        (_dead_gyro, ["the gyro read zero in all axes for 0.99 s from 1505000000 ns"]),
+        (
+            _zeros,
+            [
+                "frame 31: the IMU reads zero in all axes since 1505000000 ns",
+                "the IMU gives new readings again, after 0.99 s of zeros",
+            ],
+        ),
+        (
+            _stuck,
+            [
+                "frame 31: the IMU repeats one reading to the last bit since 1500000000 ns",
+                "the IMU gives new readings again, after 1.00 s of one reading",
+            ],
+        ),
+        (
+            _dead_gyro,
+            [
+                "frame 36: the gyro reads zero in all axes since 1505000000 ns",
+                "the gyro gives new readings again, after 0.99 s of zeros",
+            ],
+        ),
     ],
 )
 def test_each_fault_is_named_and_no_other_cause(fault: Change, expected: list[str]) -> None:
@@ -263,7 +285,26 @@ def test_an_imu_that_is_stuck_to_the_end_is_reported() -> None:
     (line,) = _lines(
         _faulty(lambda k, x, last: x if k <= 300 else replace(x, gyro=last.gyro, accel=last.accel))
     )
-    assert "repeated one reading to the last bit for 1.50 s" in line
+    assert "repeats one reading to the last bit since 1500000000 ns" in line
+
+
+def test_an_imu_that_is_stuck_is_found_while_it_is_and_holds_from_its_first_frame() -> None:
+    monitor = _monitored(_faulty(_stuck))
+    begun, ended = monitor.findings
+    assert begun.frame == 31  # exposed at 1.55 s; the reading is of 1.5 s
+    assert begun.first_frame == 31
+    assert begun.lasts
+    assert ended.ended
+    assert ended.frame == 50
+
+
+def test_zeros_from_the_start_are_found() -> None:
+    """Not even gravity is read, so no usual readings are needed to compare them with."""
+    zero = np.zeros(3)
+    monitor = _monitored(_faulty(lambda k, x, last: replace(x, gyro=zero, accel=zero)))
+    (finding,) = monitor.findings  # no word of clocks
+    assert finding.code == "imu-readings"
+    assert finding.first_frame == 1
 
 
 def test_samples_that_are_missing_for_seconds_are_no_matter_of_clocks() -> None:
@@ -352,5 +393,5 @@ def test_samples_of_a_frame_at_once_are_judged_as_one_by_one(fault: Change) -> N
     parts = np.split(np.arange(len(samples)), cuts[cuts < len(samples)])
     got = [x.time_ns for part in parts for x in at_once.take_all([samples[k] for k in part])]
     assert got == expected
-    assert at_once.finish() == single.finish()
+    assert at_once.new_faults() == single.new_faults()
     assert len(got) < len(samples)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,11 +46,45 @@ def test_a_lasting_finding_holds_until_it_has_ended() -> None:
     assert judge(monitor, range(30, 31))[0].integrity == "nominal"
 
 
+def test_an_event_does_not_end_what_lasts() -> None:
+    """A spike of the accelerometer while the gyro is stuck, both of one code."""
+    monitor = IntegrityMonitor()
+    monitor.take(Finding("imu-readings", "", 0, lasts=True))
+    judge(monitor, range(2))
+    monitor.take(Finding("imu-readings", "", 2))
+    assert {e.integrity for e in judge(monitor, range(2, 30))} == {"degraded"}
+
+
 def test_an_event_without_an_end_counts_for_a_second() -> None:
     monitor = IntegrityMonitor()
     monitor.take(Finding("estimate-restarted", "", 0))
     states = [e.integrity for e in judge(monitor, range(15))]
     assert states == ["degraded"] * 10 + ["nominal"] * 5
+
+
+def test_innovations_beyond_what_is_stated_inflate_the_covariance() -> None:
+    """What it grows by meanwhile is larger by as much, until measurements make it known again."""
+    monitor = IntegrityMonitor()
+
+    def variances(ratio: float, stated: list[float]) -> list[float]:
+        found = []
+        for k, variance in enumerate(stated):
+            monitor.take_innovation(ratio)
+            given = replace(estimate(k), covariance=variance * np.eye(6))
+            judged = monitor.judged(k, given)
+            assert judged.integrity == "nominal"
+            found.append(float(judged.covariance[0, 0]))
+        return found
+
+    usual = [1e-4, 2e-4, 1e-4, 2e-4, 3e-4]
+    assert variances(2.0, usual) == usual
+    assert variances(30.0, [4e-4]) == [4e-4]  # a shock
+    assert variances(1.0, 5 * [4e-4]) == 5 * [4e-4]
+    assert variances(6.0, [4e-4, 4e-4, 4e-4, 4e-4, 5e-4])[-1] == pytest.approx(5e-4 + 8e-4)
+    assert variances(1.0, 6 * [5e-4])[-1] == pytest.approx(5e-4 + 8e-4)
+    assert variances(1.0, [2.5e-4])[-1] == pytest.approx(2.5e-4 + 4e-4)
+    monitor.forget_innovations()
+    assert variances(1.0, [2.5e-4]) == [2.5e-4]
 
 
 def test_information_leaves_an_estimate_nominal() -> None:

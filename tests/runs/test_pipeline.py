@@ -122,6 +122,21 @@ def test_two_runs_give_the_same_bits() -> None:
     np.testing.assert_array_equal(a.trajectory.T_world_body, b.trajectory.T_world_body)
 
 
+def test_the_stated_scale_holds_what_the_sensor_says_against_it(tmp_path: Path) -> None:
+    """Not only in the covariances: a summary of 0.58 % would contradict them."""
+    right = run(FakeDrive(), Config())
+    drive = FakeDrive()
+    camera = replace(CAMERA, baseline_m=1.05 * CAMERA.baseline_m)
+    drive._recording = replace(drive.recording, camera=camera)
+    wrong = run(drive, Config())
+    stated = [
+        write_run_folder(tmp_path / name, result, None)["rig_scale_sigma"]
+        for name, result in (("right", right), ("wrong", wrong))
+    ]
+    assert stated[0] == pytest.approx(np.hypot(0.005, 0.003), rel=0.2)
+    assert stated[1] > 0.02
+
+
 def test_a_lag_gives_each_pose_what_later_frames_know() -> None:
     drive = FakeDrive(velocity=False)
     exact = load_config(

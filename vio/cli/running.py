@@ -635,7 +635,8 @@ def _scale_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         share = metrics["rig_scale_sigma"]
         path_m = metrics["path_length_m"]
         of_path = f"{metres_text(share * path_m)} of {path_m:.2f} m"
-        known = f"known to {100 * share:.2g} % by the calibration: {of_path}"
+        unchecked = " unchecked" if metrics["motion"] == "none" else ""
+        known = f"known to {100 * share:.2g} % by the{unchecked} calibration: {of_path}"
         doubted = bool(metrics.get("doubts"))
         rows.append(("scale", "in doubt: settle what the notes above name" if doubted else known))
     return rows

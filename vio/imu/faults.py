@@ -94,7 +94,7 @@ class ImuFault:
 
     kind: ImuFaultKind
     start_ns: int  # of the spike, or of the reading that was repeated
-    end_ns: int  # of the last sample concerned
+    end_ns: int | None  # of the last sample concerned; None: it has only begun
     # spike: change from its neighbours, rad/s or m/s^2; stuck: the largest of the numbers repeated;
     # clipped: the end of the range
     size: float
@@ -159,7 +159,7 @@ class ImuSampleCheck:
         if self._previous is not None:
             self._count_repeated(self._previous, sample, reading)
         # gravity is never zero in all axes
-        if any(r.stuck for r in self._repeats) or not any(reading[3:]):
+        if self.stuck or not any(reading[3:]):
             self._held = []
             return []
         if any(r.unusual for r in self._repeats):
@@ -176,23 +176,25 @@ class ImuSampleCheck:
 
     def _count_repeated(self, previous: ImuSample, sample: ImuSample, reading: _Reading) -> None:
         equal = [a == b for a, b in zip(self._last_reading, reading, strict=True)]
-        ended = [f for r in self._repeats for f in r.take(previous, sample, equal)]
-        self._faults += ended[:1]  # that of the whole IMU is that of both sensors
+        for r in self._repeats:
+            self._faults += r.take(previous, sample, equal)
+        if not any(r.announced for r in self._repeats):
+            stuck = [r for r in self._repeats if r.stuck]
+            # that of the whole IMU is that of both sensors
+            self._faults += [r.announce() for r in stuck[:1]]
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the last sample repeats the one before it by a fault."""
+        return any(r.stuck for r in self._repeats)
 
     def new_faults(self) -> tuple[ImuFault, ...]:
-        """Return the faults that ended since the last call."""
+        """Return the faults since the last call; repetitions twice, as they begin and as they
+        end.
+        """
         faults = tuple(self._faults)
         self._faults = []
         return faults
-
-    def finish(self) -> tuple[ImuFault, ...]:
-        """Return the faults that last until the end of the record."""
-        last = [
-            r.fault(self._previous.time_ns)
-            for r in self._repeats
-            if r.stuck and self._previous is not None
-        ]
-        return (*self.new_faults(), *last[:1])
 
 
 class _Repetition:
@@ -209,6 +211,7 @@ class _Repetition:
         self._start: ImuSample | None = None  # the reading that is repeated
         self.repeats = 0  # in the present row
         self.stuck = False
+        self.announced = False  # that it is
 
     def take(self, previous: ImuSample, sample: ImuSample, equal: list[bool]) -> list[ImuFault]:
         """Count a sample and which (6,) of its numbers are those of the one before; return the
@@ -219,12 +222,18 @@ class _Repetition:
             self.repeats += 1
             self.stuck = self.stuck or self._improbable(sample.time_ns)
             return []
-        ended = [self.fault(previous.time_ns)] if self.stuck else []
+        ended = [self._fault(previous.time_ns)] if self.announced else []
         for repeated in (*([True] * (0 if self.stuck else self.repeats)), False):
             self._count(repeated)
         self.repeats = 0
         self.stuck = False
+        self.announced = False
         return ended
+
+    def announce(self) -> ImuFault:
+        """Return the fault that has begun with the present row of repetitions."""
+        self.announced = True
+        return self._fault(None)
 
     def count_others(self, count: int) -> None:
         """Count samples that repeat nothing, after one that repeated nothing."""
@@ -239,7 +248,7 @@ class _Repetition:
         """Whether the last sample repeats the one before it, as few did."""
         return self.repeats > 0 and self._share < _FAULTS.rare
 
-    def fault(self, end_ns: int) -> ImuFault:
+    def _fault(self, end_ns: int | None) -> ImuFault:
         """Return the fault that the present row of repetitions is, up to a time."""
         assert self._start is not None
         reading = np.concatenate([self._start.gyro, self._start.accel])[self._part]
@@ -248,6 +257,8 @@ class _Repetition:
     def _improbable(self, time_ns: int) -> bool:
         assert self._start is not None
         alone = self._kind != "stuck IMU"
+        if not alone and self.repeats >= _FAULTS.min_repeats and not self._start.accel.any():
+            return True  # not even gravity is read
         if len(self._counted) < _FAULTS.min_history or self.repeats < _FAULTS.min_repeats:
             return False
         if alone and (time_ns - self._start.time_ns) * S_PER_NS < _FAULTS.min_part_s:

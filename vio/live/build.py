@@ -21,11 +21,13 @@ from vio.geometry.stereo import StereoCamera
 from vio.live.frame_pipeline import FramePipeline, RunParts
 from vio.live.imu_trial import ImuTrial
 from vio.live.processor import EventProcessor
+from vio.monitor.reading import ReadingCheck, pair_as_read, raw_pair
 from vio.protocols import Backend, Dataset, Detector, Frontend, Selector
 from vio.records import MotionSource, Observations, Recording, RunMotion, need_stereo
 from vio.selection.selectors import build_selector
 
 if TYPE_CHECKING:
+    from vio.cameras.rig import Rectifier
     from vio.mapping.session import MapSession
 
 log = logging.getLogger(__name__)
@@ -66,6 +68,15 @@ class Source:
     # the recording, or the features used in place of its images; None: live
     features: Dataset | None = None
     right_delay: int = 0  # frames by which right images and pixels are known to be late
+    # of a live rig's raw images; None: a recording, which has its own, or rectified images
+    rectifier: Rectifier | None = None
+
+    def reading_check(self) -> ReadingCheck | None:
+        """Return what tries other readings of the calibration; None: it is of rectified images, or
+        of one camera.
+        """
+        pair = pair_as_read(self.features) if self.rectifier is None else raw_pair(self.rectifier)
+        return None if pair is None else ReadingCheck(*pair)
 
 
 def recorded_source(dataset: Dataset, config: Config) -> Source:
@@ -81,8 +92,19 @@ def recorded_source(dataset: Dataset, config: Config) -> Source:
     )
 
 
-def live_source(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config) -> Source:
-    """Return a live rig as the source of a run; `T_cam0_imu` is (4, 4), None without an IMU.
+def live_source(
+    camera: StereoCamera,
+    T_cam0_imu: FloatArray | None,
+    config: Config,
+    rectifier: Rectifier | None = None,
+) -> Source:
+    """Return a live rig as the source of a run.
+
+    Args:
+        camera: the rectified camera.
+        T_cam0_imu: (4, 4); None: there is no IMU.
+        config: every setting.
+        rectifier: of raw images; None: they are rectified.
 
     Raises:
         ConfigError: `motion` is imu without extrinsics, or the back end has no model for it.
@@ -93,7 +115,8 @@ def live_source(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Con
     motion = _motion(
         config, sensors, missing="motion imu needs the extrinsics T_cam0_imu; give the rig them"
     )
-    return Source(camera, np.eye(4) if T_cam0_imu is None else T_cam0_imu, motion)
+    T_cam0_body = np.eye(4) if T_cam0_imu is None else T_cam0_imu
+    return Source(camera, T_cam0_body, motion, rectifier=rectifier)
 
 
 def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
@@ -233,6 +256,7 @@ def build_processor(
         ),
         use_prior=config.frontend.prior,
         trial=_trial(source, parts, backend, map),
+        reading=source.reading_check(),
     )
     session = None if map is None else _open_map(map, source, config, backend)
     return EventProcessor(pipeline, wait_for_imu=source.motion == "imu", map=session)

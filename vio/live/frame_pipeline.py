@@ -14,6 +14,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.imu_trial import AS_GIVEN, ImuTrial, corrected, corrected_all
 from vio.live.recovery import Recovery
+from vio.monitor.reading import ReadingCheck
 from vio.monitor.run import RunMonitor
 from vio.numerics.robust import median
 from vio.protocols import Backend, Frontend, Selector
@@ -54,6 +55,7 @@ class FramePipeline:
         *,
         use_prior: bool,
         trial: ImuTrial | None = None,
+        reading: ReadingCheck | None = None,
     ) -> None:
         self.frontend = parts.frontend
         self.selector = parts.selector
@@ -63,6 +65,7 @@ class FramePipeline:
         self._use_prior = use_prior
         self._propagate_ms = 0.0  # since the last frame
         self._trial = trial
+        self._reading = reading
         self._imu = AS_GIVEN
         self._revised: dict[int, Estimate] = {}
         self._recovery = Recovery()
@@ -116,6 +119,7 @@ class FramePipeline:
         estimate = self.backend.estimate()
         timer.end("update")
         self.monitor.update(frame.index, report, estimate)
+        self._check_reading(output.observations)
         estimate = self._recovered(frame.index, self.monitor.judged(frame.index, estimate))
         timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
         self._propagate_ms = 0.0
@@ -127,6 +131,14 @@ class FramePipeline:
             estimate,
             _frame_log(frame, timer.ms, output, selection, report, estimate),
         )
+
+    def _check_reading(self, seen: Observations) -> None:
+        """Report that another reading of the calibration explains the rows, where one does."""
+        found = None
+        if self._reading is not None:
+            found = self._reading.frame(seen, self.monitor.findings)
+        if found is not None:
+            self.monitor.add(found)
 
     def _track(self, frame: StereoFrame, expected: Prediction | None) -> FrontendOutput:
         """Return what the front end makes of a frame, nothing of one that was given before."""

@@ -110,7 +110,7 @@ class Odometry(EventInputs["Estimate | None"]):
             self.camera = self._rectifier.camera
             T_cam0_imu = rig.T_rect0_imu
             self._offset_ns = round(1e9 * rig.time_offset_s)
-        self._source = live_source(self.camera, T_cam0_imu, self._config)
+        self._source = live_source(self.camera, T_cam0_imu, self._config, self._rectifier)
         # Extrinsics (4, 4) of the estimated body in the rectified left camera, and what propagates
         # its pose between frames; None: images alone.
         self.T_cam0_body = self._source.T_cam0_body

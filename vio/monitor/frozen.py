@@ -3,7 +3,8 @@ them again.
 
 Equal to the last bit is the same exposure, as noise differs from one to the next, unless images
 without noise, of a simulator, show a rig at standstill: what moved up to the frame before has not
-stopped at once. Nearly equal
+stopped at once. By images alone, a rig that crept and did not slow down may have: the first such
+frames are left out, and nothing is said of them. Nearly equal
 pairs (encoded again, or with noise on top) are the same where the tracked corners have not moved,
 while the motion predicted since the last frame moves them by more than its uncertainty allows and
 the IMU is not at standstill. A rig at standstill gives nearly equal images, too; there the
@@ -52,6 +53,9 @@ class _FlowRules(NamedTuple):
     min_recent_frames: int = 5
     # flow between the two frames before (median), beyond which no rig stands still at once
     moved_px: float = 0.3
+    # the same of a rig that creeps, and does not slow down to less at the present frame …
+    crept_px: float = 0.05
+    max_crept: int = 2  # … of whose equal frames in a row so many are left out
     unmoved_px: float = 0.15  # the flow of an unmoved corner under noise of a few gray levels
     unmoved_share: float = 0.8  # of the corners that must be unmoved
     first_rows: int = 8  # compared before all others
@@ -94,6 +98,7 @@ class Repeated:
 
     of_index: int  # that frame's number
     exact: bool  # equal to the last bit
+    certain: bool = True  # False: a rig that crept and has stopped at once looks the same
 
 
 class FrozenImages:
@@ -104,6 +109,8 @@ class FrozenImages:
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
         self._seen: Observations | None = None  # its features
         self._seen_before: Observations | None = None  # those of the frame before
+        self._seen_first: Observations | None = None  # those of the frame before that one
+        self._crept = 0  # equal frames in a row that were left out as the rig crept
         self._still: tuple[int, float] | None = None  # first frame of equal ones, flow before it
         self._ended_still: tuple[int, float] | None = None  # with the present frame
         self._held_since: int | None = None
@@ -131,6 +138,7 @@ class FrozenImages:
             _, off_px = _moved(seen, self._expected.tracks)
             if len(off_px):
                 self._errors_px.append(median(off_px))
+        self._seen_first = self._seen_before
         before = self._seen_before = self._seen
         self._seen = seen
         if self._ended_still is not None and before is not None and len(before):
@@ -200,8 +208,11 @@ class FrozenImages:
     ) -> Repeated | None:
         """Judge a frame of the same images as the last one, as a rig at standstill shows them."""
         # what was given again once is, until it changes
-        if self._repeating is not None or self._moves(expected):
+        if (self._repeating is not None and self._repeating.certain) or self._moves(expected):
             return Repeated(shown.index, True)
+        if self._crept < _FLOW.max_crept and self._creeps():
+            self._crept += 1
+            return Repeated(shown.index, True, certain=False)
         self._still = self._still or (frame.index, self._flow_px())
         return None
 
@@ -211,9 +222,10 @@ class FrozenImages:
         """Judge a frame whose images differ from the last ones: perhaps by their noise alone."""
         self._ended_still = self._still
         self._still = None
+        self._crept = 0
         if self._seen is None or expected is None:
             return None
-        if self._repeating is not None:
+        if self._repeating is not None and self._repeating.certain:
             frozen = _unmoved(shown, frame, self._seen)
         else:
             frozen = self._has_stopped(frame, shown, self._seen, expected)
@@ -239,6 +251,16 @@ class FrozenImages:
         if self._imu:
             return not self._at_standstill()
         return expected is not None and self._contradicts(expected.motion)
+
+    def _creeps(self) -> bool:
+        """Whether the rig moves slowly, and would move on as its features' flow has changed; with
+        an IMU, that decides.
+        """
+        if self._imu or self._seen_first is None or self._seen_before is None:
+            return False
+        now_px = self._flow_px()
+        before_px = _median_flow_px(self._seen_first, self._seen_before)
+        return min(now_px, 2.0 * now_px - before_px) > _FLOW.crept_px
 
     def _at_standstill(self) -> bool:
         """Whether the IMU's last half second shows noise alone; steady motion looks the same,

@@ -5,17 +5,24 @@ not hold, the estimate is marked, and the covariance of one that is unusable als
 rig has moved in any direction since the fault began, as fast as it moves at most: what the filter
 says of the motion since then may be wrong by all of it. When the fault has ended, the motion is
 known again, and the position is not: what the covariance covered stays in it.
+
+Where features lie further from their predictions by the IMU than the filter expects, frame after
+frame, its new errors are larger by as much as far as anyone can say, whatever the cause is: what the
+covariance grows by is, too, long before a cause is found.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from vio.dataclass import dataclass
 from vio.findings import CODES, INTEGRITIES, Finding, Integrity, worst
 from vio.geometry.lie import FloatArray, length
+from vio.numerics.robust import median
 from vio.records import NS_PER_S, Estimate
 
 _HOLDS_NS = NS_PER_S  # an event without an end is one of the second after it
@@ -24,6 +31,18 @@ _MIN_SPEED_MPS = 0.1  # of a rig that stands still as far as the estimate says
 # one is reached, earlier frames below it are brought to it.
 _MIN_SCALE_DOUBT = 0.005
 _SCALE_DOUBT_GROWS = 1.5
+
+
+class _InnovationRules(NamedTuple):
+    """When the errors of a filter are larger than it says."""
+
+    frames: int = 5  # the newest, of whose ratios the median counts: a shock is one of them
+    # innovation over its standard deviation up to which it is usual; of healthy recordings it comes
+    # to 1.0 to 1.3, and to 2 in single frames
+    usual: float = 2.0
+
+
+_INNOVATION = _InnovationRules()
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +77,12 @@ class IntegrityMonitor:
         self._unusable_since_ns: int | None = None
         self._carried_m = 0.0  # that the position may be off by since earlier faults
         self._doubt_m = 0.0  # the same with the present one
+        # innovations over their standard deviations by a motion sensor
+        self._ratios = deque[float](maxlen=_INNOVATION.frames)
+        self._misled_m = 0.0  # what the position may be off by more than stated, as they say
+        self._largest = (
+            0.0  # variance of the position in any direction, as stated at the last frame
+        )
         # frames and the level of the scale's doubt that their covariances have from there on: less
         # in each than in the one before
         self._scale_doubts: list[tuple[int, int]] = []
@@ -92,6 +117,16 @@ class IntegrityMonitor:
                 self._marks.append(Mark(since, before, "nominal", None, scale))
         self._scale_doubts.append((since, level))
 
+    def take_innovation(self, ratio: float | None) -> None:
+        """Take the innovation of a frame over its standard deviation; None: nothing was seen."""
+        if ratio is not None:
+            self._ratios.append(ratio)
+
+    def forget_innovations(self) -> None:
+        """Forget what they said, as the sensor is not used any more, and all was estimated anew."""
+        self._ratios.clear()
+        self._misled_m = 0.0
+
     def take_marks(self) -> tuple[Mark, ...]:
         """Return the marks of earlier frames since the last call."""
         marks = tuple(self._marks)
@@ -116,12 +151,14 @@ class IntegrityMonitor:
         integrity = worst([finding.effect for finding in held])
         self._measure_speed(estimate, usable=integrity != "unusable")
         self._measure_doubt(estimate.time_ns, held)
-        if integrity == "nominal" and self._doubt_m == 0.0:
+        self._measure_misled(estimate.covariance)
+        doubt_m = float(np.hypot(self._doubt_m, self._misled_m))
+        if integrity == "nominal" and doubt_m == 0.0:
             return estimate
         codes = tuple(sorted(f.code for f in held if f.effect != "nominal"))
         covariance = estimate.covariance
-        if self._doubt_m > 0.0:
-            covariance = inflated(covariance, self._doubt_m)
+        if doubt_m > 0.0:
+            covariance = inflated(covariance, doubt_m)
         return replace(estimate, integrity=integrity, findings=codes, covariance=covariance)
 
     def _measure_doubt(self, now_ns: int, held: list[Finding]) -> None:
@@ -136,6 +173,21 @@ class IntegrityMonitor:
         self._unusable_since_ns = min(self._unusable_since_ns, *since)
         moved_m = self._speed_mps * (now_ns - self._unusable_since_ns) / NS_PER_S
         self._doubt_m = float(np.hypot(self._carried_m, moved_m))
+
+    def _measure_misled(self, covariance: FloatArray) -> None:
+        """Bring what innovations say of the position's errors to the present frame, of a stated
+        covariance (6, 6): its growth is larger by as much, and what it has lost is known again.
+        """
+        if not self._ratios:
+            return
+        before = self._largest
+        self._largest = largest = float(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+        if largest <= before:
+            self._misled_m *= float(np.sqrt(largest / before)) if before > 0.0 else 1.0
+        elif len(self._ratios) == _INNOVATION.frames:
+            factor = max(median(np.array(self._ratios)) / _INNOVATION.usual, 1.0)
+            more = (factor**2 - 1.0) * (largest - before)
+            self._misled_m = float(np.sqrt(self._misled_m**2 + more))
 
     def _onset_ns(self, finding: Finding, now_ns: int) -> int:
         """The time of the first frame that a finding holds for."""
@@ -154,7 +206,10 @@ class IntegrityMonitor:
             if CODES[finding.code].effect == "nominal":
                 continue
             until_ns = None if finding.lasts else now_ns + _HOLDS_NS
-            self._holding[finding.code] = _Holding(finding, until_ns)
+            held = self._holding.get(finding.code)
+            # an event of a second does not end one of the same code that lasts
+            if held is None or held.until_ns is not None or finding.lasts:
+                self._holding[finding.code] = _Holding(finding, until_ns)
             since = finding.first_frame
             if since is not None and since < index:
                 self._marks.append(Mark(since, index, finding.effect, finding.code))

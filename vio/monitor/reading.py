@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import RectifyingDataset
 from vio.records import Observations
+
+if TYPE_CHECKING:
+    from vio.cameras.rig import Rectifier
 
 _ROWS_OFF = ("stereo-calibration-off", "other-calibration")
 _CODE = "calibration-misread"
@@ -33,10 +36,17 @@ def pair_as_read(dataset: object) -> tuple[StereoRig, StereoCamera] | None:
     """Return the raw pair of a recording and the camera that it is rectified to; None: its images
     are rectified already, or those of one camera.
     """
-    if not isinstance(dataset, RectifyingDataset) or dataset.rectifier.maps is None:
+    return raw_pair(dataset.rectifier) if isinstance(dataset, RectifyingDataset) else None
+
+
+def raw_pair(rectifier: Rectifier) -> tuple[StereoRig, StereoCamera] | None:
+    """Return the raw pair that is rectified, and the rectified camera; None: nothing is rectified,
+    or one camera.
+    """
+    lenses = rectifier.lenses
+    if rectifier.maps is None or not isinstance(lenses, StereoRig):
         return None
-    lenses = dataset.rectifier.lenses
-    return (lenses, dataset.rectifier.camera) if isinstance(lenses, StereoRig) else None
+    return lenses, rectifier.camera
 
 
 class ReadingCheck:

@@ -94,8 +94,14 @@ class RunMonitor:
         if self._silence is not None:
             self._new += [x for x in samples if isinstance(x, ImuSample)]
 
-    def _take_new(self) -> None:
-        """Judge the samples since the last frame."""
+    def _take_new(self, index: int, time_ns: int) -> None:
+        """Judge the samples since the last frame, which a frame of this number and stamp follows."""
+        if self._faults is not None:
+            self._faults.frame(index, time_ns)
+        self._judge_new()
+
+    def _judge_new(self) -> None:
+        """Judge the samples that were not judged yet."""
         new = self._new
         self._new = []
         if self._silence is None or not new:
@@ -103,7 +109,7 @@ class RunMonitor:
         taken = 0
         for k, gap in self._silence.samples([x.time_ns for x in new]):
             self._check(new[taken:k])  # what is to be said of earlier samples comes first
-            self._report("imu-gap", [gap])
+            self._add([gap])
             taken = k
         self._check(new[taken:])
 
@@ -125,10 +131,11 @@ class RunMonitor:
         Frames come in time order, each with the back end's prediction of it.
         """
         self._index, self._index_before = frame.index, self._index
-        self._take_new()
+        self._take_new(frame.index, frame.time_ns)
         repeated = self._frozen.check(frame, expected)
         self._repeated = repeated is not None
-        self._report("frames-repeated", self._repeats.frame(frame, repeated))
+        named = repeated if repeated is not None and repeated.certain else None
+        self._report("frames-repeated", self._repeats.frame(frame, named))
         return self._repeated
 
     def without_repeated_depth(self, frame: StereoFrame) -> StereoFrame:
@@ -150,7 +157,7 @@ class RunMonitor:
         """Add the front end's observations, before feature selection, its own remarks, and the
         findings on the images.
         """
-        self._take_new()
+        self._take_new(seen.frame_index, seen.time_ns)
         if self._baseline_fault is not None and not self._frames:
             line = f"{self._baseline_fault}, or the path has another unit"
             self._report("baseline-implausible", [line])
@@ -160,9 +167,7 @@ class RunMonitor:
         self._features += len(seen)
         self._seen = seen
         if self._silence is not None:
-            self._report("imu-gap", self._silence.frame(seen.frame_index, seen.time_ns))
-        if self._faults is not None:
-            self._faults.frame(seen.frame_index)
+            self._add(self._silence.frame(seen.frame_index, seen.time_ns))
         if self._repeated:
             return
         self._frozen.observations(seen)
@@ -240,6 +245,7 @@ class RunMonitor:
         self._report("imu-not-used", [line])
         if self._contradiction is not None:
             self._add(self._contradiction.end(index))
+            self._integrity.forget_innovations()
 
     def waiting(self, frame: StereoFrame, why: str) -> None:
         """Add a frame without a pose, as the back end's start is not observable yet; `why` is
@@ -291,6 +297,7 @@ class RunMonitor:
         self._add(self._health.frame(index, report, estimate))
         if self._contradiction is not None:
             self._add(self._contradiction.frame(index, report.innovation_ratio))
+            self._integrity.take_innovation(report.innovation_ratio)
         if report.gyro_jump_radps is not None and self._inertial is not None:
             self._inertial.begin_after_jump()
         self._integrity.take_scale_doubt(index, report.scale_doubt)
@@ -310,7 +317,7 @@ class RunMonitor:
 
     def close(self) -> None:
         """Finish at the end of the run, also of a failed one."""
-        self._take_new()
+        self._judge_new()
         if self._frames and not self._features:
             self._report(
                 "no-features",
@@ -322,15 +329,11 @@ class RunMonitor:
         self._report("frames-repeated", self._repeats.finish())
         self._report("depths-repeated", self._depths.finish())
         if self._silence is not None:
-            self._report("imu-gap", self._silence.finish())
+            self._add(self._silence.finish())
         if self._faults is not None:
             self._add(self._faults.finish())
         if self._inertial is not None:
-            findings = self._inertial.finish()
-            # which is no matter of clocks
-            if self._faults is not None and self._faults.stuck_at_end:
-                findings = tuple(f for f in findings if f.group != "overlap")
-            self._report_findings(findings)
+            self._report_findings(self._inertial.finish())
         self._report_scale(last=True)
         self._report_no_pose()
         self._integrity.close(self._index)
@@ -352,6 +355,9 @@ class RunMonitor:
         # samples at the end of a range were named when they were left out
         findings = tuple(f for f in findings if not (clipped and f.fault == "saturation"))
         self._imu_at_fault |= any(f.certain and f.group in _PREVENTS_START for f in findings)
+        # samples that repeat are left out, and named; that is no matter of clocks
+        if self._faults is not None and self._faults.is_stuck:
+            findings = tuple(f for f in findings if f.group != "overlap")
         for finding in findings:
             self.imu_verdict = self.imu_verdict.after(finding)
         for finding in findings:

@@ -29,7 +29,7 @@ from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.atomic import atomic_folder, check_own
 from vio.files.printable import json_text, printable
 from vio.files.trajectories import in_first_cam0, write_kitti, write_tum
-from vio.filters.rig_calibration import field_doubt, scale_sigma
+from vio.filters.rig_calibration import scale_sigma
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.numerics import robust
@@ -501,23 +501,18 @@ def integrity_counts(result: RunResult) -> dict[str, int]:
 
 
 def rig_scale_sigma(result: RunResult) -> float | None:
-    """Return the standard deviation of the scale by the calibration, over it.
+    """Return the standard deviation of the scale by the calibration, over it, with what the run
+    found against it.
 
     None: it is estimated or left out.
     """
-    settings = result.config.msckf
-    camera = result.recording.camera
     if (
         result.config.backend != "msckf"
-        or camera.kind == "mono"
+        or result.recording.camera.kind == "mono"
         or result.estimates[-1].stereo_scale is not None
     ):
         return None
-    field = result.estimates[-1].stereo_field
-    doubt = 0.0
-    if field is not None:
-        doubt = field_doubt(camera, settings, field.coefficients, field.covariance)
-    return float(np.hypot(scale_sigma(settings), doubt))
+    return float(np.hypot(scale_sigma(result.config.msckf), result.scale_doubt))
 
 
 def camera_imu(result: RunResult) -> dict[str, Any] | None:

@@ -465,6 +465,7 @@ def _result(config: Config, state: _LiveState, recorder: RunRecorder, end: _End)
         stopped=end.failure,
         rig=state.rig,
         mapped=end.mapped,
+        scale_doubt=recorder.scale_doubt,
     )
 
 

@@ -27,8 +27,6 @@ from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import AS_READ, Repair, repaired
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, recorded_source
 from vio.live.processor import EventProcessor
-from vio.monitor.reading import ReadingCheck, pair_as_read
-from vio.monitor.run import RunMonitor
 from vio.numerics.threads import one_blas_thread
 from vio.protocols import Dataset, Detector, Frontend, RectifyingDataset, Viewer
 from vio.records import (
@@ -80,6 +78,9 @@ class RunResult:
     rig: Rig | None = None  # the calibration as given; None: features without an image size
     repair: Repair = AS_READ  # what the run put right of the recording's right images
     mapped: MappedRun | None = None  # where a map was built or used
+    # standard deviation that motion sensor and field of disparities add to what the settings state
+    # of the scale, over it
+    scale_doubt: float = 0.0
 
     def calibrated_rig(self) -> CalibratedRig | None:
         """Return the calibration with what the run found it to be off by; None: features without an
@@ -274,9 +275,7 @@ def _process(what: _Run, repair: Repair) -> RunResult:
         taken = _taken_frames(dataset, config, start, stop)
         # these lack the images that come with later ones
         taken -= set(sorted(taken)[len(taken) - abs(state.repair.delay) :])
-        pair = pair_as_read(features)
-        reading = None if pair is None else ReadingCheck(*pair)
-        loop = _Loop(state, recorder, shown, taken, reading)
+        loop = _Loop(state, recorder, shown, taken)
         try:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
@@ -309,6 +308,7 @@ def _process(what: _Run, repair: Repair) -> RunResult:
             rig=given_rig(dataset),
             repair=state.repair,
             mapped=None if session is None else _mapped(session, recorder),
+            scale_doubt=recorder.scale_doubt,
         )
 
 
@@ -420,7 +420,6 @@ class _Loop:
         recorder: RunRecorder,
         viewer: Viewer,
         frames: set[int],
-        reading: ReadingCheck | None,
     ) -> None:
         """Prepare.
 
@@ -429,10 +428,8 @@ class _Loop:
             recorder: takes the results.
             viewer: watches each frame.
             frames: numbers of the recording's frames that the run is to take.
-            reading: tries other readings of the calibration; None: it is of rectified images.
         """
         self._state = state
-        self._reading = reading
         self._recorder = recorder
         self._viewer = viewer
         self._frames = frames
@@ -500,16 +497,8 @@ class _Loop:
         monitor = self._state.processor.pipeline.monitor
         if monitor.ends_at_repair and monitor.repair != self._state.repair:
             raise _BeginAgainError(monitor.repair)
-        for result in results:
-            self._check_reading(result, monitor)
         if results:
             self._record(results)
-
-    def _check_reading(self, result: FrameResult, monitor: RunMonitor) -> None:
-        if self._reading is not None:
-            found = self._reading.frame(result.output.observations, monitor.findings)
-            if found is not None:
-                monitor.add(found)
 
     def _record(self, results: list[FrameResult]) -> None:
         state = self._state

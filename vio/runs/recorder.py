@@ -129,6 +129,8 @@ class RunRecorder:
         self._rows = FrameRows()
         self._tables: dict[str, Table] = {}
         self._early: list[Rows] = []  # samples before the first frame
+        # by what motion sensor and field let the scale be off at the newest frame, over it
+        self.scale_doubt = 0.0
         self._written = 0  # frames in the text files
         self._csv_stages: list[str] | None = None  # columns of frames.csv
         self._flushed_s = self._saved_s = time.monotonic()
@@ -165,6 +167,7 @@ class RunRecorder:
             self._begin()
         estimates = self._tables["estimates"]
         index = result.log.index
+        self.scale_doubt = result.report.scale_doubt
         self.revise(smoothed, len(estimates) - self._lag, len(estimates) - self._lag + 1)
         with self._writing():
             estimates.append(estimate_row(index, result.estimate))
