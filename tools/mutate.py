@@ -11,8 +11,8 @@ all must pass. Recordings are taken from VIO_DATA.
 
 With --constants, N constants are drawn from a seed in place of the list, from each part by its
 share: numbers at the top of a module, each times and over 1.5 (whole numbers by one at least). The
-tests of such a mutation are those of the list for its file, and the test files that name its module
-or, where there are none, a module that imports it.
+tests of such a mutation are those of the list for its file, the test files that name its module, and
+those in the folder of its package that name a module which imports it, ten at most.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ _COPIED = (
     "README.md",
     "pyproject.toml",
 )
+_MAX_FILES = 10  # of a constant's tests: those of a module that all use say nothing of it
 _MAX_S = 1200.0  # of the tests of one mutation; then one of them does not end
 # The profile is one of tests/conftest.py.
 _PYTEST = ("-q", "--tb=no", "-p", "no:cacheprovider", "--hypothesis-profile=once")
@@ -118,39 +119,53 @@ class _TestsOf:
 
     def __init__(self, root: Path) -> None:
         self._listed = {mutation.file: mutation.tests for mutation in MUTATIONS}
-        self._texts = {
-            path.relative_to(root).as_posix(): path.read_text(encoding="utf-8")
+        self._named = {
+            path.relative_to(root).as_posix(): _named_modules(path.read_text(encoding="utf-8"))
             for path in sorted((root / "tests").rglob("test_*.py"))
         }
+        self._found: dict[str, list[str]] = {}
         self._users: dict[str, list[str]] = {}
         for user, used in read_edges(root):
             self._users.setdefault(used, []).append(user)
 
     def __call__(self, module: str, file: str) -> tuple[str, ...]:
-        """Those of the list for its file, and those that name it; where none does, those that
-        name a module that imports it. Tests of the whole project name modules for other reasons.
+        """Those of the list for its file, those of its name, those that name it, and those in the
+        folder of its package that name a module which imports it (where there are none, all that
+        do), in this order. Tests of the whole project name modules for other reasons.
         """
-        listed = self._listed.get(file, ())
-        own = self._naming(module)
-        of_users = [name for user in self._users.get(module, []) for name in self._naming(user)]
-        of_mechanism = [
-            [name for name in names if not name.startswith("tests/project/")]
-            for names in (own, of_users)
-        ]
-        names = next(filter(None, of_mechanism), [] if listed else own)
-        return tuple(dict.fromkeys((*listed, *names)))
+        name = module.rpartition(".")[2]
+        own = sorted(self._naming(module), key=lambda test: name not in test)
+        of_users = [test for user in self._users.get(module, []) for test in self._naming(user)]
+        inside = [test for test in of_users if test.startswith(_folder(module))]
+        tests = [*self._listed.get(file, ()), *own, *(inside or ([] if own else of_users))]
+        of_mechanism = [test for test in tests if not test.startswith("tests/project/")]
+        return tuple(dict.fromkeys(of_mechanism or tests))[:_MAX_FILES]
 
     def _naming(self, module: str) -> list[str]:
-        """Those of the folder of its name, where there are any, are of its mechanism; others only
-        use it.
-        """
-        package, _, name = module.rpartition(".")
-        imported = re.compile(
-            rf"{re.escape(module)}\b|from {re.escape(package)} import [^()\n]*\b{name}\b"
-        )
-        naming = [test for test, text in self._texts.items() if imported.search(text)]
-        folder = f"tests/{module.split('.')[1]}/" if package else ""
-        return [test for test in naming if test.startswith(folder)] or naming
+        """Those of the folder of its package first."""
+        if module not in self._found:
+            naming = [
+                test
+                for test, names in self._named.items()
+                if any(name == module or name.startswith(f"{module}.") for name in names)
+            ]
+            naming.sort(key=lambda test: not test.startswith(_folder(module)))
+            self._found[module] = naming
+        return self._found[module]
+
+
+def _folder(module: str) -> str:
+    """Return the folder of tests that is called like a module's package."""
+    return f"tests/{module.split('.')[1]}/" if module.count(".") > 1 else "tests/nowhere/"
+
+
+def _named_modules(text: str) -> frozenset[str]:
+    """Return what a test imports of the package, and names that it mentions in its text."""
+    names = set(re.findall(r"\bvio(?:\.\w+)+", text))
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "vio":
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return frozenset(names)
 
 
 def draw_constants(
@@ -302,9 +317,10 @@ def run_tests(copy: Path, tests: Sequence[str], *options: str) -> tuple[list[str
             f"{' '.join(imported) or done.stderr.strip()[-300:]} was imported instead of {copy}"
         )
     failed = re.findall(
-        r"^(?:FAILED|ERROR) (tests/\S+?::.+?)(?: - .*)?$", done.stdout, re.MULTILINE
+        r"^(?:FAILED|ERROR) (tests/\S+?(?:::.+?)?)(?: - .*)?$", done.stdout, re.MULTILINE
     )
-    if done.returncode not in (0, 1) or (done.returncode == 1) != bool(failed):
+    # 2: a test file cannot be imported.
+    if done.returncode not in (0, 1, 2) or (done.returncode > 0) != bool(failed):
         raise MutationError(
             f"pytest ended with status {done.returncode}: "
             f"{(done.stdout + done.stderr).strip()[-900:]}"
