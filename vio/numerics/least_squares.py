@@ -21,9 +21,9 @@ class Damping:
     Journal (1963).
     """
 
-    value: float  # for the next step
     largest: float  # beyond it no step is shorter: rounding is all that is left
     smallest: float = 1e-9
+    value: float = 1e-4  # for the next step; at first, nearly that of Gauss and Newton
 
     def step(
         self, moved: Callable[[float], State], cost: Callable[[State], float], before: float
