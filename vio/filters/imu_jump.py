@@ -31,7 +31,7 @@ class _RotationRules(NamedTuple):
     min_old_views: int = 4  # of a track before the newest: what it shows has been part of the scene
     min_old_tracks: int = 15
     min_agreeing_share: float = 0.8  # share of the old tracks that one rotation must explain
-    iterations: int = 8  # of the robust fit
+    steps: int = 8  # of the robust fit
 
 
 _ROTATION = _RotationRules()
@@ -242,7 +242,7 @@ def _robust_fit(
     A = information
     # the first scale is that of the residuals themselves, as all of them are off together
     scale = max(width, float(np.median(np.sum(r**2, axis=1))))
-    for _ in range(_ROTATION.iterations):
+    for _ in range(_ROTATION.steps):
         weight = 1 / (1 + np.sum(left**2, axis=1) / scale)
         A = np.einsum("f,fki,fkj->ij", weight, B, B) / variance + information
         b = np.einsum("f,fki,fk->i", weight, B, r) / variance
