@@ -11,8 +11,9 @@ all must pass. Recordings are taken from VIO_DATA.
 
 With --constants, N constants are drawn from a seed in place of the list, from each part by its
 share: numbers at the top of a module, each times and over 1.5 (whole numbers by one at least). The
-tests of such a mutation are those of the list for its file, the test files that name its module, and
-those in the folder of its package that name a module which imports it, ten at most.
+tests of such a mutation are those of the list for its file, the test files that name its module,
+those of whole results, and those in the folder of its package that name a module which imports it,
+ten at most.
 """
 
 from __future__ import annotations
@@ -125,19 +126,30 @@ class _TestsOf:
         }
         self._found: dict[str, list[str]] = {}
         self._users: dict[str, list[str]] = {}
+        uses: dict[str, list[str]] = {}
         for user, used in read_edges(root):
             self._users.setdefault(used, []).append(user)
+            uses.setdefault(user, []).append(used)
+        self._whole = {
+            test: _reached(names, uses)
+            for test, names in self._named.items()
+            if test.endswith("/test_same_results.py")
+        }
 
     def __call__(self, module: str, file: str) -> tuple[str, ...]:
-        """Those of the list for its file, those of its name, those that name it, and those in the
-        folder of its package that name a module which imports it (where there are none, all that
-        do), in this order. Tests of the whole project name modules for other reasons.
+        """Those of the list for its file, those of its name, those that name it, those of whole
+        results that it is part of, and those in the folder of its package that name a module which
+        imports it (where there are none, all that do), in this order. Tests of the whole project
+        name modules for other reasons.
         """
         name = module.rpartition(".")[2]
         own = sorted(self._naming(module), key=lambda test: name not in test)
+        whole = [test for test, modules in self._whole.items() if module in modules]
+        whole.sort(key=lambda test: not test.startswith(_folder(module)))
         of_users = [test for user in self._users.get(module, []) for test in self._naming(user)]
         inside = [test for test in of_users if test.startswith(_folder(module))]
-        tests = [*self._listed.get(file, ()), *own, *(inside or ([] if own else of_users))]
+        more = inside or ([] if own else of_users)
+        tests = [*self._listed.get(file, ()), *own[:2], *whole, *own[2:], *more]
         of_mechanism = [test for test in tests if not test.startswith("tests/project/")]
         return tuple(dict.fromkeys(of_mechanism or tests))[:_MAX_FILES]
 
@@ -157,6 +169,17 @@ class _TestsOf:
 def _folder(module: str) -> str:
     """Return the folder of tests that is called like a module's package."""
     return f"tests/{module.split('.')[1]}/" if module.count(".") > 1 else "tests/nowhere/"
+
+
+def _reached(names: frozenset[str], uses: dict[str, list[str]]) -> set[str]:
+    """Return the modules that some names import, and all that these import."""
+    waiting = [name for full in names for name in (full, full.rpartition(".")[0]) if name in uses]
+    found = set(waiting)
+    while waiting:
+        new = set(uses.get(waiting.pop(), ())) - found
+        found |= new
+        waiting += new
+    return found
 
 
 def _named_modules(text: str) -> frozenset[str]:
