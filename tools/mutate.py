@@ -241,10 +241,12 @@ def _scaled(text: str) -> Iterator[tuple[str, str, str, str]]:
         if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
             continue
         target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+        if not isinstance(target, ast.Name) or target.id not in numbers:
+            continue
         old = ast.get_source_segment(text, node)
         value = ast.get_source_segment(text, node.value)
-        if not isinstance(target, ast.Name) or target.id not in numbers or not (old and value):
-            continue
+        assert old
+        assert value
         number = eval(compile(ast.Expression(node.value), "", "eval"), {})  # of numbers alone
         old = f"\n{' ' * node.col_offset}{old}"
         first = node.lineno - 1
