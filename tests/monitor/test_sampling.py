@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from vio.geometry.lie import FloatArray
+from vio.imu.faults import ImuSampleCheck
 from vio.imu.sampling import burst_length, repeated_readings, sampling_notes
 from vio.monitor.samples import Samples
 from vio.records import ImuRecord, ImuSample, IntArray
@@ -77,3 +78,38 @@ def test_a_gap_is_long_and_far_longer_than_a_step(step_ms: int, gap_ms: int, fou
         [ImuSample(int(t) * 1_000_000, v[:3], v[3:]) for t, v in zip(times_ms, noise, strict=True)]
     )
     assert [f.fault for f in samples.check_new(keep=True)] == ["IMU gap"] * found
+
+
+def _kept(gyro: FloatArray, step_ns: int = 5_000_000) -> tuple[list[ImuSample], list[str]]:
+    """The samples that pass, and the faults that are found, of a gyro (N,) about x."""
+    noise = np.random.default_rng(1).normal(0, 0.01, (len(gyro), 6))
+    samples = [
+        ImuSample(k * step_ns, v[:3] + np.array([g, 0, 0]), v[3:] + np.array([0, 0, 9.81]))
+        for k, (g, v) in enumerate(zip(gyro, noise, strict=True))
+    ]
+    check = ImuSampleCheck()
+    passed = check.take_all(samples)
+    return passed, [fault.kind for fault in (*check.new_faults(), *check.finish())]
+
+
+@pytest.mark.parametrize(("before", "found"), [(15, False), (25, True)])
+def test_a_spike_needs_a_history(before: int, found: bool) -> None:
+    gyro = np.zeros(60)
+    gyro[before] = 5.0
+    assert (_kept(gyro)[1] == ["gyro spike"]) == found
+
+
+@pytest.mark.parametrize(("sigmas", "found"), [(0.7, False), (1.4, True)])
+def test_a_spike_is_far_beyond_the_changes_of_motion(sigmas: float, found: bool) -> None:
+    """Robust standard deviations of the changes, over thirty."""
+    gyro = np.zeros(200)
+    gyro[100] = sigmas * 30 * 0.01 * np.sqrt(2)
+    assert (_kept(gyro, 40_000_000)[1] == ["gyro spike"]) == found
+
+
+@pytest.mark.parametrize(("left", "found"), [(0.2, True), (0.3, False)])
+def test_a_shock_does_not_come_back_at_once(left: float, found: bool) -> None:
+    gyro = np.zeros(200)
+    gyro[100] = 1.5
+    gyro[101:] = 1.5 * left
+    assert (_kept(gyro)[1] == ["gyro spike"]) == found
