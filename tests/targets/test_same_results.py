@@ -3,7 +3,7 @@ commit that says why they changed; one that moves these figures renews the file 
 
     python -m tests.targets.test_same_results
 
-and says in its message what moved and why.
+and says in its message what moved and why. Those of images hold for one version of OpenCV.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -81,9 +82,11 @@ RUNS: dict[str, Callable[[], Figures]] = {
 @pytest.mark.parametrize("name", RUNS)
 def test_calibrations_are_those_of_the_last_change(name: str) -> None:
     kept = json.loads(FILE.read_text(encoding="utf-8"))
+    if "pixels" in kept[name] and kept["OpenCV"] != cv2.__version__:
+        pytest.skip("the figures are those of another version of OpenCV")
     assert RUNS[name]() == pytest.approx(kept[name], rel=1e-5, abs=1e-9)
 
 
 if __name__ == "__main__":
-    made = {name: run() for name, run in RUNS.items()}
+    made = {"OpenCV": cv2.__version__, **{name: run() for name, run in RUNS.items()}}
     FILE.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
