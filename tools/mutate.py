@@ -14,6 +14,15 @@ share: numbers at the top of a module, each times and over 1.5 (whole numbers by
 tests of such a mutation are those of the list for its file, the test files that name its module,
 those of whole results, and those in the folder of its package that name a module which imports it,
 ten at most.
+
+Fresh samples, November 2026, of 1,515 constants (nine of ten is the aim):
+
+- seed 5201, before `test_same_results.py`: 3 of 16 changes detected, the others of 48 not run;
+- seed 5202, 20 constants: 15 of 40 detected, 10 of them by whole results; 4 survived all tests, and 21
+  those that were run in the time (of those whose tests are slow, whole results or the others are open).
+
+Survivors are in kinds: limits of what is rarely met (gaps, folders, swapped cameras), figures that only
+a sentence states, weights of offline estimates, effects of the laboratory beyond the rendered scenes.
 """
 
 from __future__ import annotations
