@@ -41,7 +41,7 @@ class _RansacRules(NamedTuple):
     prior_min_support_share: float = 0.4
     min_points: int = 8  # with fewer points, a consensus may be chance
     min_share: float = 0.2  # smallest share of inliers of a consensus
-    refine_iterations: int = 6
+    max_refine_steps: int = 6
     # change of a motion, in radians and metres, below which it is not refined further
     converged_change: float = 3e-6
 
@@ -60,7 +60,7 @@ class _ConsensusRules(NamedTuple):
     prior_px: float = 2.0  # median distance from them below which a motion represents them
     # change of that motion, in radians and metres, below which it is not refined further
     prior_converged: float = 1e-4
-    sample_iterations: int = 5
+    max_sample_steps: int = 5
     damping: float = 1e-4
     # two views constrain a track in one direction only, so most tracks must be inliers
     min_bearing_share: float = 0.5
@@ -131,7 +131,7 @@ def _gauss_newton(
     pixels: FloatArray,
     weight: FloatArray,
     *,
-    iterations: int,
+    steps: int,
     free: slice,
 ) -> FloatArray:
     """Refine motions (H, 4, 4), each on its own points (H, K, 3), pixels (H, K, 2) and weights (H,
@@ -144,9 +144,7 @@ def _gauss_newton(
     points = np.ascontiguousarray(p_prev)
     seen = np.ascontiguousarray(pixels)
     w = np.ascontiguousarray(weight)
-    _iterate(
-        camera_args(camera), T, _Seen(points, seen, w), _Steps(np.inf, iterations, free.stop, 0.0)
-    )
+    _iterate(camera_args(camera), T, _Seen(points, seen, w), _Steps(np.inf, steps, free.stop, 0.0))
     return T
 
 
@@ -336,7 +334,7 @@ def _refine(
         camera_args(camera),
         T,
         _Seen(points[None], seen[None], equal),
-        _Steps(scale_px, _RANSAC.refine_iterations, free.stop, converged),
+        _Steps(scale_px, _RANSAC.max_refine_steps, free.stop, converged),
     )
     return T[0]
 
@@ -362,7 +360,7 @@ def _ransac(
         p_prev[sets],
         pixels[sets],
         np.ones(sets.shape),
-        iterations=_CONSENSUS.sample_iterations,
+        steps=_CONSENSUS.max_sample_steps,
         free=free,
     )
     T = np.concatenate([starts, refined[None], T])
@@ -614,12 +612,10 @@ def predicted_motion(
         return None
     T = expected
     weight = np.ones((1, len(p)))
-    for _ in range(_CONSENSUS.sample_iterations):
+    for _ in range(_CONSENSUS.max_sample_steps):
         if median(pixel_errors(camera, T, p, z)) <= _CONSENSUS.prior_px:
             return T
-        T = _gauss_newton(
-            camera, T[None], p[None], z[None], weight, iterations=1, free=slice(0, 6)
-        )[0]
+        T = _gauss_newton(camera, T[None], p[None], z[None], weight, steps=1, free=slice(0, 6))[0]
     T = _refine(
         camera, T, p, z, _CONSENSUS.prior_px, slice(0, 6), converged=_CONSENSUS.prior_converged
     )
@@ -760,7 +756,7 @@ def _bearing_ransac(
         ]
     T = np.concatenate(models)
     best = T[int(np.argmin(_cost(problem, seen, T[:, :3, :3], T[:, :3, 3])))]
-    for _ in range(_RANSAC.refine_iterations):
+    for _ in range(_RANSAC.max_refine_steps):
         better = _bearing_step(problem, seen, best)
         if _cost(problem, seen, better[:3, :3], better[:3, 3]) >= _cost(
             problem, seen, best[:3, :3], best[:3, 3]

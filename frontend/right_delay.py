@@ -20,7 +20,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.findings import Finder, Finding
 from vio.frontend.tracks import Tracks
-from vio.frontend.weighted_fit import add_equations
+from vio.frontend.weighted_fit import ROW_SIGMA_PX, add_equations
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays
 from vio.numerics.compiled import solve_positive
@@ -39,7 +39,6 @@ class _DelayRules(NamedTuple):
     explained_share: float = 0.5
     # standard deviations of the delay: errors of a feature's rows last for as long as the feature
     min_sigmas: float = 10.0
-    row_sigma_px: float = 0.5  # of the rows, beyond which a match counts less (Cauchy)
     # a delay this near to whole frames is one of whole frames: an image was paired with the wrong
     # one
     whole_slack_frames: float = 0.15
@@ -124,7 +123,7 @@ class RightDelay(Finder):
         terms = np.array([np.ones(len(x)), x, y, x * y, x * x, y * y, flow[:, 1]]).T.copy()
         self._normal = _DELAY.memory * self._normal
         self._moment = _DELAY.memory * self._moment
-        sigma = _DELAY.row_sigma_px if self._frames else np.inf
+        sigma = ROW_SIGMA_PX if self._frames else np.inf
         count, square = add_equations(
             terms, rows, self._solution, sigma, self._normal, self._moment
         )

@@ -7,6 +7,8 @@ from __future__ import annotations
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
 
+ROW_SIGMA_PX = 0.5  # of right rows minus left ones: a match that is further off counts less
+
 
 @compiled
 def add_equations(

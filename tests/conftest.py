@@ -18,8 +18,8 @@ ROOT = Path(__file__).resolve().parent.parent
 # The files that take longest. They begin first, so that no worker is left with one when the others
 # have ended.
 LONGEST = (
-    "test_examples", "test_inertial_check", "test_docs", "test_imu_start", "test_tutorials", "test_cli",
-    "test_unfinished_runs", "test_imu_gaps",
+    "test_same_results", "test_examples", "test_inertial_check", "test_docs", "test_imu_start", "test_tutorials",
+    "test_cli", "test_unfinished_runs", "test_imu_gaps",
     "test_ros2", "test_msckf", "test_bench", "test_colmap", "test_frontend_renders", "test_filter_truth",
     "test_bench_cluster", "test_sim_realism", "test_render_cli", "test_online_calibration", "test_frontend_prior",
     "test_live_odometry", "test_bench_maps", "test_sources", "test_earth", "test_stereo_calibration",

@@ -131,13 +131,13 @@ def gauss_newton(
     pixels: FloatArray,
     weight: FloatArray,
     *,
-    iterations: int,
+    steps: int,
     free: slice,
 ) -> FloatArray:
     """Motions (H, 4, 4), each refined on its own points (H, K, 3), pixels (H, K, 2) and weights
     (H, K).
     """
-    for _ in range(iterations):
+    for _ in range(steps):
         p = p_prev @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
         ahead = depth_of(camera, p) > 0.05
         p = np.where(ahead[..., None], p, np.array([0.0, 0.0, 1.0]))
@@ -173,7 +173,7 @@ def refined_motion(
         )
         before = T
         one = (T[None], p_prev[None], pixels[None], weight[None])
-        T = gauss_newton(camera, *one, iterations=1, free=slice(0, 6))[0]
+        T = gauss_newton(camera, *one, steps=1, free=slice(0, 6))[0]
         if np.abs(T - before).max() < converged:
             break
     return T

@@ -11,6 +11,7 @@ is downloaded by pip, for aarch64 and in the versions of this environment.
 
 from __future__ import annotations
 
+import argparse
 import os
 import shlex
 import subprocess
@@ -33,18 +34,24 @@ _GLIBC = (17, 24, 26, 27, 28, 34)  # minor versions in the tags of wheels
 _MAX_APART_M = 1e-3  # sums in another order; a wrong loop is off by far more
 
 
-def main(argv: list[str]) -> int:
+def main() -> int:
     """Return 0 where all recordings give the same poses, without compiling, on both machines."""
-    if len(argv) < 3:
-        print(__doc__)
-        return 2
-    root = Path(argv[0]).resolve()
-    wheel = Path(argv[1]).resolve()
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("root", type=Path, metavar="ROOT")
+    parser.add_argument("wheel", type=Path, metavar="WHEEL")
+    parser.add_argument("sources", nargs="+", metavar="SOURCE")
+    args = parser.parse_args()
+    root = args.root.resolve()
+    wheel = args.wheel.resolve()
     _name_processor(root)
     with tempfile.TemporaryDirectory() as folder:
         site = Path(folder) / "site"
         _install(wheel, site)
-        far = [name for name in argv[2:] if _difference_m(root, site, name, Path(folder)) is None]
+        far = [
+            name for name in args.sources if _difference_m(root, site, name, Path(folder)) is None
+        ]
     return 1 if far else 0
 
 
@@ -125,4 +132,4 @@ def _difference_m(root: Path, site: Path, source: str, folder: Path) -> float | 
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

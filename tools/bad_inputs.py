@@ -8,6 +8,7 @@ built (`tools/site_hooks.py`), and is kept nowhere else.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import importlib
 import io
@@ -99,6 +100,9 @@ def page() -> str:
 
 def main() -> int:
     """Print the page."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     sys.stdout.write(page())
     return 0
 

@@ -10,6 +10,7 @@ that of this machine is run and must compile nothing.
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import subprocess
@@ -30,15 +31,12 @@ _COMMANDS = (
 )
 
 
-def main(argv: list[str]) -> int:
+def check(dist: Path) -> int:
     """Return 0 where the installed commands run and write what they should."""
-    if len(argv) != 1:
-        print(__doc__)
-        return 2
-    dist = Path(argv[0]).resolve()
+    dist = dist.resolve()
     wheels = sorted(dist.glob("*.whl"))
     if len(wheels) != 1:
-        print(f"error: {argv[0]} holds {len(wheels)} wheels; run `make wheel`", file=sys.stderr)
+        print(f"error: {dist} holds {len(wheels)} wheels; run `make wheel`", file=sys.stderr)
         return 1
     with tempfile.TemporaryDirectory() as folder:
         environment = Path(folder) / "env"
@@ -100,5 +98,14 @@ def main(argv: list[str]) -> int:
     return 0
 
 
+def main() -> int:
+    """Check the wheels of a folder."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dist", type=Path, help="the folder of the wheels")
+    return check(parser.parse_args().dist)
+
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

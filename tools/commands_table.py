@@ -37,6 +37,9 @@ def with_table(text: str) -> str:
 
 def main() -> int:
     """Rewrite the page."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
     return 0
 

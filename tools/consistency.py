@@ -125,7 +125,7 @@ class UncertainStart(Msckf):
         self._start = _START[start]
         self._begun = False
         self._learn_noise = learn_noise
-        self._frame.tracks = self._judged = JudgedTracks(CAMERA, settings)
+        self._frame.fit.tracks = self._judged = JudgedTracks(CAMERA, settings)
 
     @property
     def nis(self) -> list[float]:

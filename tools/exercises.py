@@ -8,6 +8,7 @@ printed.
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import sys
@@ -40,6 +41,9 @@ def pairs() -> list[tuple[Path, Path]]:
 
 def main() -> int:
     """Write all exercises."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     for solution, tasks in pairs():
         tasks.write_text(exercise(solution.read_text(encoding="utf-8")), encoding="utf-8")
     return 0

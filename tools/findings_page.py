@@ -5,6 +5,9 @@ python -m tools.findings_page > docs/findings.md
 
 from __future__ import annotations
 
+import argparse
+import sys
+
 from vio.findings import CODES
 
 _INTRODUCTION = """# Findings and integrity
@@ -38,5 +41,14 @@ def page() -> str:
     return _INTRODUCTION + "".join(rows)
 
 
-if __name__ == "__main__":
+def main() -> int:
+    """Print the page."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     print(page(), end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -4,6 +4,7 @@ of the project.
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import subprocess
 import sys
@@ -15,6 +16,7 @@ EXTRAS = ("pytest", "torch", "kornia", "distributed", "cyclonedds", "pyrealsense
 
 def main() -> int:
     """Print the file to stdout."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     missing = [name for name in EXTRAS if importlib.util.find_spec(name) is None]
     if missing:
         print(

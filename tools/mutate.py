@@ -11,8 +11,18 @@ all must pass. Recordings are taken from VIO_DATA.
 
 With --constants, N constants are drawn from a seed in place of the list, from each part by its
 share: numbers at the top of a module, each times and over 1.5 (whole numbers by one at least). The
-tests of such a mutation are those of the list for its file, and the test files that name its module
-or, where there are none, a module that imports it.
+tests of such a mutation are those of the list for its file, the test files that name its module,
+those of whole results, and those in the folder of its package that name a module which imports it,
+ten at most.
+
+Fresh samples, November 2026, of 1,515 constants (nine of ten is the aim):
+
+- seed 5201, before `test_same_results.py`: 3 of 16 changes detected, the others of 48 not run;
+- seed 5202, 20 constants: 15 of 40 detected, 10 of them by whole results; 4 survived all tests, and 21
+  those that were run in the time (of those whose tests are slow, whole results or the others are open).
+
+Survivors are in kinds: limits of what is rarely met (gaps, folders, swapped cameras), figures that only
+a sentence states, weights of offline estimates, effects of the laboratory beyond the rendered scenes.
 """
 
 from __future__ import annotations
@@ -48,6 +58,7 @@ _COPIED = (
     "README.md",
     "pyproject.toml",
 )
+_MAX_FILES = 10  # of a constant's tests: those of a module that all use say nothing of it
 _MAX_S = 1200.0  # of the tests of one mutation; then one of them does not end
 # The profile is one of tests/conftest.py.
 _PYTEST = ("-q", "--tb=no", "-p", "no:cacheprovider", "--hypothesis-profile=once")
@@ -118,39 +129,75 @@ class _TestsOf:
 
     def __init__(self, root: Path) -> None:
         self._listed = {mutation.file: mutation.tests for mutation in MUTATIONS}
-        self._texts = {
-            path.relative_to(root).as_posix(): path.read_text(encoding="utf-8")
+        self._named = {
+            path.relative_to(root).as_posix(): _named_modules(path.read_text(encoding="utf-8"))
             for path in sorted((root / "tests").rglob("test_*.py"))
         }
+        self._found: dict[str, list[str]] = {}
         self._users: dict[str, list[str]] = {}
+        uses: dict[str, list[str]] = {}
         for user, used in read_edges(root):
             self._users.setdefault(used, []).append(user)
+            uses.setdefault(user, []).append(used)
+        self._whole = {
+            test: _reached(names, uses)
+            for test, names in self._named.items()
+            if test.endswith("/test_same_results.py")
+        }
 
     def __call__(self, module: str, file: str) -> tuple[str, ...]:
-        """Those of the list for its file, and those that name it; where none does, those that
-        name a module that imports it. Tests of the whole project name modules for other reasons.
+        """Those of the list for its file, those of its name, those that name it, those of whole
+        results that it is part of, and those in the folder of its package that name a module which
+        imports it (where there are none, all that do), in this order. Tests of the whole project
+        name modules for other reasons.
         """
-        listed = self._listed.get(file, ())
-        own = self._naming(module)
-        of_users = [name for user in self._users.get(module, []) for name in self._naming(user)]
-        of_mechanism = [
-            [name for name in names if not name.startswith("tests/project/")]
-            for names in (own, of_users)
-        ]
-        names = next(filter(None, of_mechanism), [] if listed else own)
-        return tuple(dict.fromkeys((*listed, *names)))
+        name = module.rpartition(".")[2]
+        own = sorted(self._naming(module), key=lambda test: name not in test)
+        whole = [test for test, modules in self._whole.items() if module in modules]
+        whole.sort(key=lambda test: not test.startswith(_folder(module)))
+        of_users = [test for user in self._users.get(module, []) for test in self._naming(user)]
+        inside = [test for test in of_users if test.startswith(_folder(module))]
+        more = inside or ([] if own else of_users)
+        tests = [*self._listed.get(file, ()), *own[:2], *whole, *own[2:], *more]
+        of_mechanism = [test for test in tests if not test.startswith("tests/project/")]
+        return tuple(dict.fromkeys(of_mechanism or tests))[:_MAX_FILES]
 
     def _naming(self, module: str) -> list[str]:
-        """Those of the folder of its name, where there are any, are of its mechanism; others only
-        use it.
-        """
-        package, _, name = module.rpartition(".")
-        imported = re.compile(
-            rf"{re.escape(module)}\b|from {re.escape(package)} import [^()\n]*\b{name}\b"
-        )
-        naming = [test for test, text in self._texts.items() if imported.search(text)]
-        folder = f"tests/{module.split('.')[1]}/" if package else ""
-        return [test for test in naming if test.startswith(folder)] or naming
+        """Those of the folder of its package first."""
+        if module not in self._found:
+            naming = [
+                test
+                for test, names in self._named.items()
+                if any(name == module or name.startswith(f"{module}.") for name in names)
+            ]
+            naming.sort(key=lambda test: not test.startswith(_folder(module)))
+            self._found[module] = naming
+        return self._found[module]
+
+
+def _folder(module: str) -> str:
+    """Return the folder of tests that is called like a module's package."""
+    return f"tests/{module.split('.')[1]}/" if module.count(".") > 1 else "tests/nowhere/"
+
+
+def _reached(names: frozenset[str], uses: dict[str, list[str]]) -> set[str]:
+    """Return the modules that some names import, and all that these import."""
+    waiting = [name for full in names for name in (full, full.rpartition(".")[0]) if name in uses]
+    found = set(waiting)
+    while waiting:
+        new = set(uses.get(waiting.pop(), ())) - found
+        found |= new
+        waiting += new
+    return found
+
+
+def _named_modules(text: str) -> frozenset[str]:
+    """Return what a test imports of the package, and names that it mentions in its text."""
+    names = set(re.findall(r"\bvio(?:\.\w+)+", text))
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "vio":
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return frozenset(names)
 
 
 def draw_constants(
@@ -203,10 +250,12 @@ def _scaled(text: str) -> Iterator[tuple[str, str, str, str]]:
         if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
             continue
         target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+        if not isinstance(target, ast.Name) or target.id not in numbers:
+            continue
         old = ast.get_source_segment(text, node)
         value = ast.get_source_segment(text, node.value)
-        if not isinstance(target, ast.Name) or target.id not in numbers or not (old and value):
-            continue
+        assert old
+        assert value
         number = eval(compile(ast.Expression(node.value), "", "eval"), {})  # of numbers alone
         old = f"\n{' ' * node.col_offset}{old}"
         first = node.lineno - 1
@@ -302,9 +351,10 @@ def run_tests(copy: Path, tests: Sequence[str], *options: str) -> tuple[list[str
             f"{' '.join(imported) or done.stderr.strip()[-300:]} was imported instead of {copy}"
         )
     failed = re.findall(
-        r"^(?:FAILED|ERROR) (tests/\S+?::.+?)(?: - .*)?$", done.stdout, re.MULTILINE
+        r"^(?:FAILED|ERROR) (tests/\S+?(?:::.+?)?)(?: - .*)?$", done.stdout, re.MULTILINE
     )
-    if done.returncode not in (0, 1) or (done.returncode == 1) != bool(failed):
+    # 2: a test file cannot be imported.
+    if done.returncode not in (0, 1, 2) or (done.returncode > 0) != bool(failed):
         raise MutationError(
             f"pytest ended with status {done.returncode}: "
             f"{(done.stdout + done.stderr).strip()[-900:]}"

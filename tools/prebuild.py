@@ -16,6 +16,7 @@ exception: replacements mend it while it works. It needs a C++ compiler and setu
 
 from __future__ import annotations
 
+import argparse
 import base64
 import hashlib
 import importlib
@@ -489,18 +490,26 @@ def build_here() -> None:
         prebuilt.FOLDER.rename(final)
 
 
-def main(argv: list[str]) -> int:
+def main() -> int:
     """Compile for a wheel or a checkout."""
-    if argv[:1] == ["--write"]:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dist", nargs="?", type=Path, help="a folder with the plain wheel")
+    parser.add_argument("--write", type=Path, metavar="DIR", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.write:
         compile_loops()
-        write_codes(Path(argv[1]))
-    elif argv:
-        (plain,) = Path(argv[0]).glob("*-py3-none-any.whl")
-        print(*write_wheels(plain), sep="\n")
+        write_codes(args.write)
+    elif args.dist:
+        plain = sorted(args.dist.glob("*-py3-none-any.whl"))
+        if len(plain) != 1:
+            parser.error(f"{args.dist} holds {len(plain)} plain wheels; run `make wheel`")
+        print(*write_wheels(plain[0]), sep="\n")
     else:
         build_here()
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

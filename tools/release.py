@@ -6,6 +6,7 @@ python -m tools.release            # in dist/; needs `pip install build twine`
 
 from __future__ import annotations
 
+import argparse
 import re
 import shutil
 import subprocess
@@ -41,6 +42,9 @@ def problems(root: Path, version: str) -> list[str]:
 
 def main() -> int:
     """Return 0 where only the upload is left to do."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     found = problems(ROOT, __version__)
     changed = subprocess.run(
         ["git", "status", "--porcelain"], cwd=ROOT, capture_output=True, text=True, check=True
@@ -56,7 +60,7 @@ def main() -> int:
     subprocess.run([sys.executable, "-m", "build", "--outdir", str(dist), str(ROOT)], check=True)
     archives = sorted(map(str, dist.iterdir()))
     subprocess.run([sys.executable, "-m", "twine", "check", "--strict", *archives], check=True)
-    if check_wheel.main([str(dist)]):
+    if check_wheel.check(dist):
         return 1
     print(
         "not ready: see above"

@@ -5,7 +5,9 @@ python tools/settings_page.py > docs/settings.md
 
 from __future__ import annotations
 
+import argparse
 import re
+import sys
 
 from vio.config import BASIC, Config, SettingInfo, describe
 
@@ -54,5 +56,14 @@ def _meaning(row: SettingInfo) -> str:
     return f"{row.doc}{choices}".replace("|", "\\|")
 
 
-if __name__ == "__main__":
+def main() -> int:
+    """Print the page."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     print(page(), end="")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

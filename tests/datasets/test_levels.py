@@ -13,6 +13,7 @@ from vio.datasets import image_pairs, open_dataset
 from vio.datasets.bags.pictures import band_of_message, gray_of
 from vio.datasets.images import levels_in, load_gray
 from vio.datasets.levels import FULL_SCALE, Levels, band_of, is_mosaic, levels_of, to_8_bits
+from vio.datasets.plain import image_folders
 from vio.geometry.lie import FloatArray
 from vio.records import StereoFrame
 
@@ -138,3 +139,22 @@ def test_levels_are_those_of_eight_frames_over_the_recording(
     assert len(seen) == 2 * looked_at
     assert seen[:2] == list(pairs[0])
     assert seen[-2:] == list(pairs[-1])
+
+
+@pytest.mark.parametrize(("others", "found"), [(190, 1), (210, 0)])
+def test_a_tree_of_many_folders_is_not_searched_for_images_for_ever(
+    others: int, found: int, tmp_path: Path
+) -> None:
+    for k in range(others):
+        (tmp_path / f"a{k:03}").mkdir()
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "0.png").touch()
+    assert len(image_folders(tmp_path)) == found
+
+
+@pytest.mark.parametrize(("depth", "found"), [(3, 1), (4, 0)])
+def test_images_lie_a_few_levels_deep(depth: int, found: int, tmp_path: Path) -> None:
+    folder = tmp_path.joinpath(*"abcd"[:depth])
+    folder.mkdir(parents=True)
+    (folder / "0.png").touch()
+    assert len(image_folders(tmp_path)) == found

@@ -18,10 +18,10 @@ from scipy.stats import chi2
 from tests.replaced_rules import replaced
 from tests.true_world import TrueWorld
 from vio.filters import imu_start, navigation
-from vio.filters.frame_update import FrameUpdate
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
+from vio.filters.window_fit import WindowFit
 from vio.filters.window_tracks import LinearTracks, WindowTracks
 from vio.geometry.lie import (
     FloatArray,
@@ -595,10 +595,10 @@ def test_a_fit_goes_on_while_it_was_far_and_comes_nearer(
         def newest_innovation(self) -> float:
             return self._residual
 
-    update, left = FrameUpdate.__new__(FrameUpdate), [Tracks(r) for r in residuals]
-    monkeypatch.setattr(update, "_information", lambda *_: (np.eye(1), np.zeros(1), None))
-    monkeypatch.setattr(update, "_move_to_optimum", lambda *_: None)
-    monkeypatch.setattr(update, "_linearise", lambda *_: left.pop(0))
-    tracks, _ = update._fit(None, Tracks(innovation), None, innovation)  # type: ignore[arg-type]
+    update, left = WindowFit.__new__(WindowFit), [Tracks(r) for r in residuals]
+    monkeypatch.setattr(update, "information", lambda *_: (np.eye(1), np.zeros(1), None))
+    monkeypatch.setattr(update, "move_to_optimum", lambda *_: None)
+    monkeypatch.setattr(update, "linearise", lambda *_: left.pop(0))
+    tracks, _ = update.fit(None, Tracks(innovation), None, innovation)  # type: ignore[arg-type]
     assert len(residuals) - len(left) == steps
     assert tracks.newest_innovation() == residuals[steps - 1]

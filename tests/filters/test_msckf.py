@@ -665,7 +665,7 @@ def test_tracks_have_their_say_when_the_oldest_clone_leaves_and_not_before() -> 
     ids = set.intersection(*(set(flight.observe(k, 0.0, exact).ids.tolist()) for k in range(5)))
     odd, even = {i for i in ids if i % 2}, {i for i in ids if i % 2 == 0}
     assert min(len(odd), len(even)) > 10
-    table = filt._frame.tracks.table
+    table = filt._frame.fit.tracks.table
     left = dict(zip(table.ids(table.rows()).tolist(), table.rows().tolist(), strict=True))
     assert odd <= left.keys()
     assert not even & left.keys()
@@ -687,7 +687,7 @@ def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(
         covariance: FloatArray,
         by_considered: FloatArray | None = None,
     ) -> None:
-        table = filt._frame.tracks.table
+        table = filt._frame.fit.tracks.table
         rows = table.rows()
         views = table.views(rows[np.isin(table.ids(rows), ids[:1])], len(window.clones))
         T = window.clones.T_world_imu

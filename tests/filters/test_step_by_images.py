@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from tests.filters.test_msckf import CAMERA, EXACT_RIG, T_CAM0_IMU
 from vio.filters.msckf import Msckf
-from vio.filters.step_by_images import linked_points, step_by_images
+from vio.filters.step_by_images import (
+    explained_share,
+    is_lost,
+    linked_points,
+    step_by_images,
+)
 from vio.filters.track_records import Views
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import project
@@ -69,3 +77,44 @@ def test_a_body_that_stops_in_a_gap_is_where_it_stopped(gap_s: float) -> None:
         T = T_CAM0_IMU @ se3_inverse(estimate.T_world_imu) @ se3_inverse(T_CAM0_IMU)
         assert np.linalg.norm(T[:3, 3] - T_cam0_first[:3, 3]) < 0.3
     assert np.sqrt(np.trace(estimate.covariance[:3, :3])) < 0.3
+
+
+@pytest.mark.parametrize(("count", "found"), [(11, False), (12, True)])
+def test_a_dozen_features_show_a_motion(count: int, found: bool) -> None:
+    step = step_by_images(CAMERA, *linked_points(CAMERA, _views(MOTION, count=count)))
+    assert (step is not None) == found
+
+
+@pytest.mark.parametrize(("disparity_px", "linked"), [(1.8, 0), (2.2, 60)])
+def test_features_far_away_link_no_frames(disparity_px: float, linked: int) -> None:
+    views = _views(MOTION)
+    views.z[:, 0, 2] = views.z[:, 0, 0] - disparity_px
+    assert len(linked_points(CAMERA, views)[0]) == linked
+
+
+@pytest.mark.parametrize(("off_px", "share"), [(3.5, 1.0), (4.5, 0.0)])
+def test_a_feature_some_pixels_off_is_not_explained(off_px: float, share: float) -> None:
+    p = np.column_stack([np.linspace(-2, 2, 20), np.zeros(20), np.full(20, 6.0)])
+    z = project(CAMERA, transform_points(MOTION, p))
+    z[:, 1] += off_px
+    assert explained_share(CAMERA, MOTION, p, z) == share
+
+
+@pytest.mark.parametrize(("moving", "found"), [(27, True), (33, False)])
+def test_half_of_the_features_must_show_the_motion(moving: int, found: bool) -> None:
+    p, z = linked_points(CAMERA, _views(MOTION))
+    z[:moving, 1] += np.where(np.arange(moving) % 2, 90.0, -90.0)
+    assert (step_by_images(CAMERA, p, z) is not None) == found
+
+
+@pytest.mark.parametrize(
+    ("off_px", "usable", "lost"),
+    [(14.0, 20, False), (16.0, 20, True), (1.0, 11, False), (1.0, 9, True)],
+)
+def test_a_prediction_is_lost_where_tracks_are_far_off_or_behind(
+    off_px: float, usable: int, lost: bool
+) -> None:
+    tracks: Any = SimpleNamespace(rows=np.arange(usable), newest_innovation=lambda: off_px)
+    no_landmarks = Views(np.zeros((0, 4)), np.zeros((0, 4)))
+    anything: Any = None
+    assert is_lost(anything, anything, tracks, 20, no_landmarks) == lost

@@ -193,7 +193,7 @@ def test_fit_converges_near_its_start_at_any_rotation(turn: float) -> None:
         slice(0, 6),
     )
     near = outliers._gauss_newton(
-        CAMERA, start[None], before[None], seen[None], np.ones((1, 60)), iterations=5, free=free
+        CAMERA, start[None], before[None], seen[None], np.ones((1, 60)), steps=5, free=free
     )
     found = outliers._refine(CAMERA, near[0], before, seen, LIMIT_PX, free)
     np.testing.assert_allclose(found, T, atol=1e-6)

@@ -399,3 +399,32 @@ def test_images_that_contradict_from_the_start_leave_lengths_unknown(
         [(0, "unusable", False)] if unknown else []
     )
     assert [f.ended for f in found] == ([False, True] if unknown else [])
+
+
+@pytest.mark.parametrize(("blind", "usable"), [(39, False), (40, True)])
+def test_the_right_image_is_tried_again_after_long_without_points(blind: int, usable: bool) -> None:
+    """Two seconds in which nothing can be tested, at 20 Hz."""
+    camera = _contradicted()
+    for k in range(blind):
+        camera.check_matches(4 + k, np.zeros(5, dtype=np.bool_), moved=True)
+    assert camera.usable == usable
+
+
+@pytest.mark.parametrize(("matched", "usable"), [(27, False), (33, True)])
+def test_three_of_ten_points_that_match_contradict_nothing(matched: int, usable: bool) -> None:
+    camera = RightCamera()
+    assert camera.check_matches(0, np.arange(100) < matched, moved=True) == usable
+
+
+@pytest.mark.parametrize(("matched", "usable"), [(55, False), (65, True)])
+def test_six_of_ten_points_agree_again(matched: int, usable: bool) -> None:
+    camera = _contradicted()
+    for k in range(3):
+        camera.check_matches(4 + k, np.arange(100) < matched, moved=True)
+    assert camera.usable == usable
+
+
+@pytest.mark.parametrize(("points", "usable"), [(19, True), (20, False)])
+def test_fewer_than_twenty_points_contradict_nothing(points: int, usable: bool) -> None:
+    camera = RightCamera()
+    assert camera.check_matches(0, np.zeros(points, dtype=np.bool_), moved=True) == usable

@@ -388,3 +388,29 @@ def test_matches_are_lost_below_a_fifth_of_the_usual_share(share: float, is_lost
         check.inspect(replace(frame, has_right=has_right), nothing)
     found = [finding.code for finding in check.take_findings()]
     assert found == (["right-matches-lost"] if is_lost else [])
+
+
+def _matches_found(shares: list[float], count: int = 60) -> list[str]:
+    """Codes of what is found by the shares of features with a right match, frame by frame."""
+    check = LostMatches()
+    nothing = _shared(0, 0.0, 0.0)
+    seen = flight()
+    codes = []
+    for k, share in enumerate(shares):
+        frame = seen[k % len(seen)].take(np.arange(count))
+        some = np.arange(count) < round(share * count)
+        check.inspect(replace(frame, frame_index=k, has_right=some), nothing)
+        codes += [f.code + " ended" * f.ended for f in check.take_findings()]
+    return codes
+
+
+@pytest.mark.parametrize(("share", "is_back"), [(0.45, False), (0.55, True)])
+def test_matches_are_back_from_half_of_the_usual_share_on(share: float, is_back: bool) -> None:
+    found = _matches_found([1.0] * 5 + [0.05] * 5 + [share] * 5)
+    assert found == ["right-matches-lost", "right-matches-lost ended"][: 1 + is_back]
+
+
+@pytest.mark.parametrize(("usual", "is_lost"), [(0.28, False), (0.32, True)])
+def test_where_few_features_match_anyway_none_are_lost(usual: float, is_lost: bool) -> None:
+    found = _matches_found([usual] * 5 + [0.0] * 5)
+    assert found == (["right-matches-lost"] if is_lost else [])

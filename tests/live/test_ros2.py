@@ -39,7 +39,7 @@ from vio.ros2.node import NodeSettings, run_node
 from vio.ros2.opening import open_transport
 from vio.ros2.outputs import FrameNames, Outputs
 from vio.ros2.play import Playing, play
-from vio.ros2.sensors import Sensors, SensorTopics, Silence, check_types
+from vio.ros2.sensors import Sensors, SensorTopics, Silence, _Step, check_types
 from vio.ros2.transport import Quality, publisher
 from vio.runs.finished import read_finished_run
 from vio.runs.live_folder import LiveRunSettings
@@ -864,3 +864,21 @@ def test_the_files_for_colcon_name_the_command() -> None:
     assert len(options) == 6
     assert all(f'"{option}"' in shared for option in options)
     assert "<name>stereo_vio</name>" in (folder / "package.xml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("stamped_s", "arrived_s", "back", "ahead"),
+    [
+        (-0.45, 0.05, False, False),
+        (-0.55, 0.05, True, False),
+        (4.5, 0.05, False, False),
+        (5.5, 0.05, False, True),
+        (10.0, 0.9, False, True),
+        (10.0, 1.1, False, False),  # a bag that is played ten times as fast
+    ],
+)
+def test_a_stamp_far_from_the_last_one_begins_anew(
+    stamped_s: float, arrived_s: float, back: bool, ahead: bool
+) -> None:
+    step = _Step(round(stamped_s * 1e9), round(arrived_s * 1e9))
+    assert (step.is_back, step.is_ahead) == (back, ahead)

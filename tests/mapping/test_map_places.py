@@ -292,3 +292,13 @@ def test_words_are_the_chosen_bits_and_counted_once_a_keyframe() -> None:
     counts = [np.bincount(row, minlength=1 << 14) > 0 for row in expected]
     again = [np.bincount(row[:100], minlength=1 << 14) > 0 for row in expected]
     np.testing.assert_array_equal(index._frequency, np.add(counts, again, dtype=np.int64))
+
+
+@pytest.mark.parametrize(("differing", "matched"), [(62, 1), (66, 0)])
+def test_a_quarter_of_the_bits_of_two_descriptors_may_differ(differing: int, matched: int) -> None:
+    bits = np.zeros(256, dtype=np.uint8)
+    bits[:differing] = 1
+    one = np.zeros((1, 32), dtype=np.uint8)
+    zero = np.zeros(1, dtype=np.int64)
+    rows, _ = _most_alike(zero, zero, one, np.packbits(bits)[None])
+    assert len(rows) == matched

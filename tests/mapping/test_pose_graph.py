@@ -27,10 +27,10 @@ from vio.geometry.lie import (
     se3_log,
 )
 from vio.geometry.relative_pose import RelativePose
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import StereoCamera, project
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.loop_geometry import Verified
+from vio.mapping.loop_geometry import Verified, pose_of_most
 from vio.mapping.map_graph import MapGraph, _nearest
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.place_finder import FoundPlace
@@ -611,3 +611,15 @@ def test_no_call_holds_the_interpreter_for_a_frame_while_a_loop_is_settled_in_a_
     longest.pop("gstrf")
     # s, a quarter of a frame; a search of the whole map takes 11 ms
     assert max(longest.values()) < 0.008, longest
+
+
+@pytest.mark.parametrize(("off_px", "agree"), [(3.0, True), (5.0, False)])
+def test_points_of_a_loop_agree_within_some_pixels(off_px: float, agree: bool) -> None:
+    """Half of the points are exact; with the others, that are off to all sides, all are asked."""
+    rng = np.random.default_rng(0)
+    camera = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
+    p = np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(4, 8, 40)])
+    uv = project(camera, p)[:, :2]
+    angle = rng.uniform(0, 2 * np.pi, 20)
+    uv[20:] += off_px * np.column_stack([np.cos(angle), np.sin(angle)])
+    assert (pose_of_most(camera, p, uv, 34) is not None) == agree

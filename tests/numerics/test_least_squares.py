@@ -29,7 +29,7 @@ def test_steps_never_raise_the_cost_and_reach_the_optimum() -> None:
     """The first undamped step leads from 24 to 2000."""
     x = np.array([-1.2, 1.0])
     assert _cost(_moved(x, 0.0)) > 1000.0
-    damping = Damping(1e-4, 1e8)
+    damping = Damping(1e8, value=1e-4)
     costs = [_cost(x)]
     for _ in range(100):
         found = damping.step(lambda value, x=x: _moved(x, value), _cost, costs[-1])
@@ -49,12 +49,12 @@ def test_ends_where_no_damping_helps(largest: float, tried: list[float]) -> None
         asked.append(value)
         return value
 
-    assert Damping(1.0, largest).step(moved, lambda _: np.inf, 3.0) is None
+    assert Damping(largest, value=1.0).step(moved, lambda _: np.inf, 3.0) is None
     assert asked == tried
 
 
 def test_grows_and_shrinks_tenfold_down_to_its_least() -> None:
-    damping = Damping(1e-3, 1e8, smallest=1e-4)
+    damping = Damping(1e8, smallest=1e-4, value=1e-3)
     # too long a step, with less damping than 0.05
     assert damping.step(lambda value: value, lambda value: float(value < 0.05), 0.5) == (0.1, 0.0)
     assert damping.value == pytest.approx(0.01)

@@ -300,3 +300,40 @@ def test_depth_without_a_surface_gives_none() -> None:
         camera = StereoCamera(100.0, 100.0, 32.0, 32.0, 0.1, 64, 64)
         grid.fuse(depth, np.zeros((64, 64), np.uint8), camera, np.eye(4), 5.0)
         assert len(extract_surface(grid, least_seen=1).triangles) == 0
+
+
+def _plan_at(p: FloatArray, x_m: float) -> int:
+    """Level of the floor plan of points (N, 3) at (x, 1)."""
+    vertices = p.astype(np.float32) + np.float32(1e-3)
+    mesh = Mesh(vertices, vertices, np.zeros_like(vertices, np.uint8), np.zeros((0, 3), np.uint32))
+    plan = occupancy_grid(mesh, np.eye(3), 0.1)
+    assert plan is not None
+    column, row = np.floor((np.array([x_m, 1.01]) - plan.origin_m) / plan.cell_m).astype(int)
+    return int(plan.levels[row, column])
+
+
+def _floor(x_m: FloatArray, z_m: float) -> FloatArray:
+    x, y = (g.ravel() for g in np.meshgrid(x_m, np.arange(0, 2, 0.1)))
+    return np.stack([x, y, np.full_like(x, z_m)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("height_m", "level"), [(0.17, FREE), (0.23, OCCUPIED), (1.8, OCCUPIED), (2.2, FREE)]
+)
+def test_an_obstacle_stands_above_a_step_and_below_a_door(height_m: float, level: int) -> None:
+    things = np.array([[1.01, 1.01, height_m], [1.02, 1.02, height_m]])
+    assert _plan_at(np.concatenate([_floor(np.arange(0, 2, 0.1), 0.0), things]), 1.01) == level
+
+
+@pytest.mark.parametrize(("points", "level"), [(1, FREE), (2, OCCUPIED)])
+def test_one_vertex_is_no_obstacle(points: int, level: int) -> None:
+    things = np.tile([1.01, 1.01, 1.0], (points, 1))
+    assert _plan_at(np.concatenate([_floor(np.arange(0, 2, 0.1), 0.0), things]), 1.01) == level
+
+
+@pytest.mark.parametrize(("x_m", "level"), [(1.3, OCCUPIED), (2.0, FREE)])
+def test_a_plateau_is_ground_away_from_its_edge(x_m: float, level: int) -> None:
+    """1.5 m is about the reach of a robot: what is that far is not beside it."""
+    below = _floor(np.arange(-2, 0, 0.1), 0.0)
+    above = _floor(np.arange(0, 4, 0.1), 0.5)
+    assert _plan_at(np.concatenate([below, above]), x_m) == level

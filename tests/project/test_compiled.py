@@ -127,8 +127,8 @@ def test_gauss_newton_on_motions_equals_numpy(free: slice, camera: StereoCamera)
     pixels = rng.uniform([0, 0], [300, 200], (20, 3, 2))
     weight = rng.uniform(0, 1, (20, 3))
     weight[2, 1] = 0.0
-    ours = _gauss_newton(camera, T, points, pixels, weight, iterations=2, free=free)
-    twin = numpy_twins.gauss_newton(camera, T, points, pixels, weight, iterations=2, free=free)
+    ours = _gauss_newton(camera, T, points, pixels, weight, steps=2, free=free)
+    twin = numpy_twins.gauss_newton(camera, T, points, pixels, weight, steps=2, free=free)
     np.testing.assert_allclose(ours, twin, rtol=1e-6, atol=1e-6)
 
 

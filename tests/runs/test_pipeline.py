@@ -37,7 +37,7 @@ from vio.records import (
     VelocitySample,
     observations,
 )
-from vio.runs.folder import write_run_folder
+from vio.runs.folder import start_s, write_run_folder
 from vio.runs.pipeline import run
 from vio.runs.stated import read_run
 from vio.runs.tables import ESTIMATE, FRAME
@@ -496,3 +496,8 @@ def test_an_error_of_refused_frames_gives_their_reason_and_not_the_last_warning(
         DataError, match=r"^most frames were refused: frame \d+ has no precomputed observations"
     ):
         run(Hollow(), Config())
+
+
+@pytest.mark.parametrize(("slowest_ms", "start"), [(90.0, 0.0), (110.0, 0.1)])
+def test_frames_that_take_ten_times_as_long_are_the_start(slowest_ms: float, start: float) -> None:
+    assert start_s(np.array([slowest_ms, *[10.0] * 20])) == pytest.approx(start)

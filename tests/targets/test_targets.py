@@ -647,3 +647,14 @@ def test_the_command_writes_a_board_and_its_description(suffix: str, tmp_path: P
     assert main(["target", str(page), "--kind", "charuco", "--size", "0.03"]) == 0
     assert page.stat().st_size > 1000
     assert read_target(page.with_suffix(".yaml")).size_m == 0.03
+
+
+@pytest.mark.parametrize(("off_px", "kept"), [(0.27, True), (0.34, False)])
+def test_a_corner_of_an_exact_view_may_be_off_by_a_third_of_a_pixel(
+    off_px: float, kept: bool
+) -> None:
+    detector = CornerDetector(GRID)
+    uv = 100.0 + 2000.0 * detector.points_m[:, :2]
+    middle = len(uv) // 2
+    uv[middle, 0] += off_px
+    assert detector._agree(np.arange(len(uv)), uv)[middle] == kept

@@ -90,7 +90,7 @@ class _FitRules(NamedTuple):
 
     # of numeric derivatives by the parameters, which are all of the size of radians
     step_rad: float = 1e-6
-    iterations: int = 15  # of Gauss-Newton; the weights of the prior need most of them
+    steps: int = 15  # of Gauss-Newton; the weights of the prior need most of them
 
 
 _FIT = _FitRules()
@@ -325,7 +325,7 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     x = np.zeros(len(PARAMETERS))
     J = np.zeros((TERMS, len(PARAMETERS)))
     information = np.diag(1 / _PRIOR**2)
-    for round_ in range(_FIT.iterations):
+    for round_ in range(_FIT.steps):
         prior = np.diag(1 / (_PRIOR**2 + x**2))
         for k in np.flatnonzero(free & (round_ in _LINEARISED)):
             step = _FIT.step_rad * np.eye(len(PARAMETERS))[k]

@@ -24,7 +24,7 @@ from vio.records import BoolArray
 class _AlignmentRules(NamedTuple):
     """The fit of gyro bias, velocity and gravity to bearings."""
 
-    iterations: int = 6
+    steps: int = 6
     bearing_sigma_rad: float = 2e-3  # rad, a pixel of a usual lens; larger residuals lose weight
     min_shared_tracks: int = 8  # tracks that two views share, for their rotation to be used
     tiny: float = 1e-12
@@ -78,7 +78,7 @@ def gyro_bias(bearings: Bearings, motion: FreeMotion, sigma_radps: float) -> Flo
     K = len(motion.times_s)
     u = np.einsum("kij,fkj->fki", motion.R_first_body, bearings.rays)
     pairs = [(j, k) for j in range(K) for k in (j + 1, j + 2) if k < K]
-    for _ in range(_ALIGNMENT.iterations):
+    for _ in range(_ALIGNMENT.steps):
         turns = motion.phi_D_bias @ bias
         now = u + np.cross(turns, u)
         A = np.eye(3) / sigma_radps**2
@@ -151,7 +151,7 @@ def align_visual_inertial(
     b = -np.einsum("fkij,fkj->fki", across, fixed[first][:, None] - fixed)
     weight = seen.astype(np.float64)
     x = np.zeros(6)
-    for _ in range(_ALIGNMENT.iterations):
+    for _ in range(_ALIGNMENT.steps):
         H_xx = np.einsum("fk,fkai,fkaj->ij", weight, A_x, A_x)
         H_xd = np.einsum("fk,fkai,fka->fi", weight, A_x, A_d)
         H_dd = np.einsum("fk,fka,fka->f", weight, A_d, A_d) + _ALIGNMENT.tiny

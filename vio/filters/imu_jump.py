@@ -11,6 +11,7 @@ estimate both anew: equation (N15) of docs/math.md.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from vio.filters.multiview import CAUCHY
 from vio.filters.navigation import Growth, NavState
 from vio.filters.track_records import Residuals
+from vio.filters.window import Window
 from vio.filters.window_tracks import VIEW_PROBABILITY, LinearTracks, chi_square_table
 from vio.geometry.lie import FloatArray, so3_hat
 from vio.records import BoolArray
@@ -29,7 +31,7 @@ class _RotationRules(NamedTuple):
     min_old_views: int = 4  # of a track before the newest: what it shows has been part of the scene
     min_old_tracks: int = 15
     min_agreeing_share: float = 0.8  # share of the old tracks that one rotation must explain
-    iterations: int = 8  # of the robust fit
+    steps: int = 8  # of the robust fit
 
 
 _ROTATION = _RotationRules()
@@ -46,6 +48,8 @@ class _JumpRules(NamedTuple):
     quiet_steps: int = 20
     newest_steps: int = 3
     max_off_steps: int = 3
+    # innovations over their standard deviation (median): more, and the gyro may have jumped
+    innovation_sigmas: float = 2.0
     changed_sigmas: float = 3.0  # of the bias before: less is no jump
     # of the larger one: rates of two steps that differ by less are one jump
     alike_share: float = 0.5
@@ -93,7 +97,7 @@ def turn_of_images(
     return turn
 
 
-def gyro_doubt(growth: Growth, nav: NavState, turn: FloatArray, seconds: float) -> FloatArray:
+def _gyro_doubt(growth: Growth, nav: NavState, turn: FloatArray, seconds: float) -> FloatArray:
     """Return the covariance (15, 15) that a navigation state lacks after a step over which the
     gyro was off by a rotation (3,): that of a bias of this size, and of such a rotation alone.
 
@@ -123,6 +127,57 @@ class GyroJump:
         self._rate: FloatArray | None = None  # (3,) that the last step was off by
         # (3,) the bias before it was doubted, and its standard deviations then; None: it is not
         self._before: tuple[FloatArray, FloatArray] | None = None
+
+    def is_contradicted(self, innovation_ratio: float | None) -> bool:
+        """Whether innovations over their standard deviation, median, contradict the prediction;
+        None: there are none.
+        """
+        return (innovation_ratio or 0.0) > _JUMP.innovation_sigmas
+
+    def turn(
+        self,
+        predicted: LinearTracks,
+        moved: FloatArray,
+        T_world_imu: FloatArray,
+        *,
+        off: bool,
+        measured: bool,
+    ) -> FloatArray | None:
+        """Take a step; return the rotation (3,) by which the images contradict a gyro that is off.
+
+        None: they do not, or the gyro has not measured it. See `turn_of_images` for the first three
+        arguments.
+
+        Args:
+            predicted: tracks at the predicted pose.
+            moved: covariance (6, 6) of the predicted motion.
+            T_world_imu: (4, 4) predicted pose of the body.
+            off: whether the images contradict the prediction.
+            measured: whether the gyro has predicted the step.
+        """
+        settled = self.is_settled(off=off)
+        if not off or not measured or not settled:
+            return None
+        return turn_of_images(predicted, moved, T_world_imu)
+
+    def doubts(
+        self, window: Window, turn: FloatArray, growth: Growth, agree: Callable[[], bool]
+    ) -> bool:
+        """Whether the newest step contradicts the gyro by a rotation (3,) that inflated noise of
+        one step does not explain; then its bias becomes uncertain by that.
+
+        Args:
+            window: whose newest step it is.
+            turn: the rotation, rad.
+            growth: of the state's error over the step.
+            agree: whether the tracks agree with one another after a fit.
+        """
+        seconds = window.last_step_s
+        if not self.repeats(turn / seconds) and agree():
+            return False
+        self.doubt(window.nav.gyro_bias, np.sqrt(np.diag(window.prior.P)[9:12]))
+        window.inflate_process_noise(_gyro_doubt(growth, window.nav, turn, seconds))
+        return True
 
     def is_settled(self, *, off: bool) -> bool:
         """Take a step, and whether the images contradict it; return whether the start, which learns
@@ -187,7 +242,7 @@ def _robust_fit(
     A = information
     # the first scale is that of the residuals themselves, as all of them are off together
     scale = max(width, float(np.median(np.sum(r**2, axis=1))))
-    for _ in range(_ROTATION.iterations):
+    for _ in range(_ROTATION.steps):
         weight = 1 / (1 + np.sum(left**2, axis=1) / scale)
         A = np.einsum("f,fki,fkj->ij", weight, B, B) / variance + information
         b = np.einsum("f,fki,fk->i", weight, B, r) / variance

@@ -11,6 +11,11 @@ from __future__ import annotations
 import numpy as np
 
 from vio.filters import gate_loops as loops
+from vio.filters.prior import Fit
+from vio.filters.track_records import Views
+from vio.filters.window import Window
+from vio.filters.window_fit import WindowFit
+from vio.filters.window_posterior import landmark_covariance
 from vio.filters.window_tracks import chi_square_table
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, IntArray
@@ -50,6 +55,24 @@ class LandmarkGate:
     def __init__(self, probability: float) -> None:
         self._limits = chi_square_table(probability)
         self._score: dict[int, float] = {}
+
+    def test(
+        self, fit: WindowFit, window: Window, pixels: Views, fitted: Fit
+    ) -> tuple[BoolArray, BoolArray]:
+        """Judge the landmarks (K,) of a window by their newest pixels after a fit, see `check`."""
+        at = fit.landmark_residuals(window, pixels)
+        variance = fit.tracks.variance
+        # that they entered the fit with
+        weight = at.weight * (variance / fit.variance)
+        nis = leave_one_out_nis(
+            at.r,
+            fit.landmark_jacobian(window, pixels, at),
+            landmark_covariance(window, fitted),
+            weight,
+            variance,
+        )
+        dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)
+        return self.check(window.landmark_ids, nis, dof)
 
     def check(self, ids: IntArray, nis: FloatArray, dof: IntArray) -> tuple[BoolArray, BoolArray]:
         """Judge the landmarks of a frame.

@@ -175,7 +175,7 @@ class Msckf(Backend):
         return (
             None
             if predicted is None
-            else Prediction(self._frame.expected_tracks(window, *predicted), predicted[1])
+            else Prediction(self._frame.fit.expected_tracks(window, *predicted), predicted[1])
         )
 
     def update(self, observations: Observations) -> UpdateReport:

@@ -20,11 +20,11 @@ from vio.filters.navigation import (
     Transition,
     TwistMotion,
 )
-from vio.filters.noise import MotionNoise
+from vio.filters.noise import MotionNoise, StepErrors
 from vio.filters.online_calibration import NO_TWIST, Twist, body_twist, walk_variances
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.imu.settings import ImuSettings
 from vio.records import ImuSample, MotionPrior, MotionSample, MotionSource
 
@@ -164,6 +164,31 @@ class Propagation:
             and self.source is None
             and bool(np.linalg.eigvalsh(of_rotation)[-1] > _LINEAR_RAD**2)
         )
+
+    def end_step(self) -> None:
+        """Let the next step begin at the present frame."""
+        self.since_frame = NO_STEP
+
+    def step_errors(
+        self, window: Window, predicted: FloatArray, expected: FloatArray, remaining: FloatArray
+    ) -> StepErrors:
+        """Return the errors of the step since the last frame, after a fit.
+
+        It is the camera's motion, seen from the body, so that a new estimate of the extrinsics is
+        no motion.
+
+        Args:
+            window: after the fit.
+            predicted: (4, 4) motion of the camera.
+            expected: covariance (6, 6) of that, world's side.
+            remaining: the same of the fitted motion.
+        """
+        moved = window.camera_move_since(-2)
+        A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
+        process = A @ self.since_frame.Q[:6, :6] @ A.T
+        B = se3_adjoint(se3_inverse(window.calibration.T_cam0_imu))
+        correction = B @ se3_log(se3_inverse(predicted) @ moved)
+        return StepErrors(correction, A @ expected @ A.T, process, A @ remaining @ A.T)
 
     def take(self, sample: MotionSample) -> None:
         """Take a motion sample, which may change what the next step looks like."""

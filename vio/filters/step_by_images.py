@@ -12,8 +12,21 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.filters.track_records import Views
-from vio.geometry.lie import FloatArray, circledot, se3_exp, transform_points
+from vio.filters.window import Window
+from vio.filters.window_fit import WindowFit
+from vio.filters.window_tracks import LinearTracks
+from vio.geometry.lie import (
+    FloatArray,
+    circledot,
+    se3_exp,
+    se3_inverse,
+    se3_log,
+    so3_exp,
+    so3_left_jacobian_inverse,
+    transform_points,
+)
 from vio.geometry.stereo import StereoCamera, depth_of, project, triangulate, z_D_p_cam
+from vio.records import IntArray
 
 
 class _StepRules(NamedTuple):
@@ -26,6 +39,16 @@ class _StepRules(NamedTuple):
 
 
 _STEP = _StepRules()
+
+
+class _LostRules(NamedTuple):
+    """Where a fit does not begin at the predicted pose."""
+
+    min_usable_share: float = 0.5  # of the tracks and landmarks, that have a usable point there
+    max_start_px: float = 15.0  # by which they are off
+
+
+_LOST = _LostRules()
 _WIDTHS_PX = (60.0, 30.0, 15.0, 8.0, 4.0, 4.0)  # of the robust fit, one a step
 
 
@@ -81,3 +104,52 @@ def explained_share(
     ahead = depth_of(camera, moved) > 0.0
     off = np.linalg.norm((z[ahead] - project(camera, moved[ahead]))[:, :3], axis=1)
     return float(np.sum(off < near_px)) / max(len(p_prev), 1)
+
+
+def is_lost(
+    fit: WindowFit, window: Window, tracks: LinearTracks, given: int, pixels: Views
+) -> bool:
+    """Whether the predicted pose is too far off for a fit to begin there: of the tracks that
+    were given, fewer than half could be linearised, or they or the landmarks are far off.
+    """
+    innovation = tracks.newest_innovation()
+    lost = len(tracks.rows) < _LOST.min_usable_share * given
+    if lost or (innovation is not None and innovation > _LOST.max_start_px):
+        return True
+    if len(pixels.z) <= given or len(window.clones) < 2:
+        return False
+    T = window.T_cam0_world(-1)[0]
+    share = explained_share(
+        fit.camera,
+        T,
+        window.landmarks,
+        fit.corrected(window, pixels).z,
+        _LOST.max_start_px,
+    )
+    return share < _LOST.min_usable_share
+
+
+def begin_by_images(fit: WindowFit, window: Window, rows: IntArray, pixels: Views) -> None:
+    """Move the newest pose to where the images alone have it; the prior stays where it is, and
+    so do points.
+    """
+    clones = len(window.clones)
+    if clones < 2:
+        return
+    T = window.T_cam0_world(clones - 2)
+    camera = fit.camera
+    p, z = linked_points(camera, fit.views(window, rows))
+    p = np.concatenate([p, transform_points(T[0], window.landmarks)])
+    z = np.concatenate([z, fit.corrected(window, pixels).z])
+    step = step_by_images(camera, p, z)
+    if step is None:
+        return
+    xi = se3_log(se3_inverse(step @ T[0]) @ T[1])  # of the body, as of the camera: world's side
+    state = window.state
+    error = np.zeros(state.size)
+    error[:6] = xi
+    error[state.clone(-1)] = xi
+    landmarks = window.landmarks
+    kept = (landmarks - landmarks @ so3_exp(xi[3:]).T) @ so3_left_jacobian_inverse(xi[3:]).T
+    error[state.landmarks] = kept.reshape(-1)
+    window.relinearise(error)

@@ -110,6 +110,12 @@ class LinearTracks:
             return None
         return stereo_columns(self.field.columns(), self.at, self.z, self.weight)
 
+    def directions(self, chosen: IntArray) -> FloatArray:
+        """Return where chosen points (K,) are in the newest image: x / z, y / z (K, 2)."""
+        out = np.empty((len(chosen), 2))
+        loops.write_directions(chosen, self.T_cam0_world[-1], self.p_world, out)
+        return out
+
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels.
 

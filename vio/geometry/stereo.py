@@ -33,6 +33,7 @@ CameraKind: TypeAlias = Literal["stereo", "rgbd", "mono"]
 # it is the nearest depth, and a track enters the estimate once its inverse depth is known as well
 # as by a stereo pair of this baseline.
 MONO_UNIT_M = 0.1
+DEPTH_DISPARITY_PX = 0.5  # of a pair; less is within its noise, and gives no depth
 
 
 class _BaselineRules(NamedTuple):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.findings import Finding
-from vio.frontend.weighted_fit import add_equations
+from vio.frontend.weighted_fit import ROW_SIGMA_PX, add_equations
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.match_check import Hysteresis, MatchCheck, SharedMatches, without_right
@@ -27,7 +27,6 @@ class _RowRules:
     min_matches: int = 20  # in a frame that tells
     min_frames: int = 5  # that the field was learned from
     memory: float = 0.97  # per frame, of the normal equations
-    row_sigma_px: float = 0.5  # of the rows, beyond which a match counts less (Cauchy)
     # median distance from the field that contradicts it: that of rows that are random within 1.5
     # px, in which descriptors are matched …
     min_rows_px: float = 0.75
@@ -101,7 +100,7 @@ class DisplacedMatches(MatchCheck):
     def _learn(self, terms: FloatArray, rows: FloatArray, off_px: float) -> None:
         self._normal *= _ROWS.memory
         self._moment *= _ROWS.memory
-        sigma = _ROWS.row_sigma_px if self._frames else np.inf
+        sigma = ROW_SIGMA_PX if self._frames else np.inf
         add_equations(terms, rows, self._field, sigma, self._normal, self._moment)
         self._field = self._moment.copy()
         solve_positive(self._normal + 1e-6 * np.eye(_TERMS), self._field)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from vio.calibration.stereo_field import DisplacementField
 from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import DEPTH_DISPARITY_PX
 from vio.records import BoolArray, Image, IntArray
 
 Bits: TypeAlias = npt.NDArray[np.uint8]
@@ -54,7 +55,6 @@ class _KeyPointRules(NamedTuple):
     levels: int = 8  # pyramid of the detector: up to 3.6 times nearer
     scale: float = 1.2
     max_disparity_share: float = 0.4  # of the width
-    min_disparity_px: float = 0.5
     max_bits: int = 64  # in which the descriptors of one point differ: a quarter
 
 
@@ -186,7 +186,7 @@ def _right_pixels(
     found = refined[:, 0].astype(np.float64)
     good = (status[:, 0] > 0) & (np.abs(found[:, 1] - uv[rows, 1]) <= _EXTRACTION.lk_rows_px)
     good &= np.abs(found[:, 0] - start[:, 0, 0]) <= _EXTRACTION.rows_px * scale[rows]
-    good &= uv[rows, 0] - found[:, 0] >= _KEY_POINTS.min_disparity_px
+    good &= uv[rows, 0] - found[:, 0] >= DEPTH_DISPARITY_PX
     out[rows[good]] = found[good]
     valid[rows[good]] = True
     return out, valid

@@ -41,8 +41,8 @@ class _Fitting:
     same_m: float = 0.1  # by which both directions may differ; metres, beside a share of the depth
     same_deg: float = 3.0
     same_depth: float = 0.05
-    steps: int = 10  # largest change, m and rad
-    converged: float = 1e-5
+    max_steps: int = 10
+    converged: float = 1e-5  # change, m and rad
     gate: float = 3.0  # standard deviations, of a pixel coordinate
     # Floor of a loop's standard deviations: errors that its points share, such as those of the
     # calibration.
@@ -324,7 +324,7 @@ def fit_terms(
     normal = np.eye(6)
     P = 1e-9 * np.eye(6) if prior is None else np.asarray(np.linalg.inv(prior.covariance))
     squared = np.zeros(sum(len(part.stereo) for part in parts))
-    for step in range(_FITTING.steps):
+    for step in range(_FITTING.max_steps):
         width = _FITTING.gate * 2.0 ** max(2 - step, 0)
         normal = np.zeros((6, 6))
         pull = np.zeros(6)

@@ -1,5 +1,18 @@
 """The damping of nonlinear least squares by Levenberg and Marquardt, for any state and any way to
 solve for a step.
+
+Loops that do not use it, and why:
+
+- Compiled loops (`filters/track_loops`, `frontend/align`, `frontend/outliers`): machine code calls
+  no Python function for a step or a cost.
+- Undamped steps that begin at a linear solution, or at the last frame's (`filters/alignment`,
+  `mono_start`, `imu_jump`, `step_by_images`, `frame_update`, `vislam`, `mapping/loop_geometry`,
+  `calibration/stereo_field`, `targets/blurred`, `offline/refine`, `offline/points`): robust weights
+  change from step to step, so that a cost of the last ones does not judge a step.
+- Graduated weights (`mapping/pose_graph`, `earth/alignment`): each step has another cost.
+- `calibration/gyro` and `calibration/stereo` fit once and use `scipy.optimize.least_squares`.
+
+Everywhere, `steps` is how many are made, and `max_steps` how many at most.
 """
 
 from __future__ import annotations
@@ -21,9 +34,9 @@ class Damping:
     Journal (1963).
     """
 
-    value: float  # for the next step
     largest: float  # beyond it no step is shorter: rounding is all that is left
     smallest: float = 1e-9
+    value: float = 1e-4  # for the next step; at first, nearly that of Gauss and Newton
 
     def step(
         self, moved: Callable[[float], State], cost: Callable[[State], float], before: float

@@ -153,7 +153,7 @@ class InertialAdjustment:
         self, body: BodyStates, progress: Callable[[], None]
     ) -> tuple[Fit, Preintegrated, bool]:
         at = Fit(body, self.tracks.p_world, np.zeros(_SHARED))
-        damping = Damping(_ADJUSTMENT.first_damping, _ADJUSTMENT.max_damping)
+        damping = Damping(_ADJUSTMENT.max_damping, value=_ADJUSTMENT.first_damping)
         steps = self._preintegrated(body)
         for n in range(_ADJUSTMENT.max_steps):
             progress()

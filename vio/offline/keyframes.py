@@ -12,11 +12,9 @@ from vio.calibration.egomotion import CameraMotion
 from vio.errors import DataError, EstimationError
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_exp
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera
 from vio.offline.loop_tracks import loop_pairs
 from vio.records import FeatureTracks, IntArray, LoopEvent, Observations, Trajectory
-
-_MIN_DISPARITY_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +155,7 @@ def loop_ends(run: TrackedPath, most: int | None) -> IntArray:
 def _median_depth_m(run: TrackedPath) -> float:
     tracks = run.tracks
     disparity = (tracks.z[:, 0] - tracks.z[:, 2])[tracks.has_right & ~tracks.stale]
-    disparity = disparity[disparity > _MIN_DISPARITY_PX]
+    disparity = disparity[disparity > DEPTH_DISPARITY_PX]
     if not len(disparity):
         raise EstimationError(
             f"{run.where}: not observable because no feature has a right match with a positive "

@@ -9,7 +9,7 @@ import numpy as np
 
 from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.geometry.stereo import StereoCamera, project, triangulate, z_D_p_cam
+from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
 from vio.offline.keyframes import TrackedPath
 from vio.offline.loop_tracks import loop_rows
 from vio.records import BoolArray, IntArray, Landmarks
@@ -18,7 +18,6 @@ from vio.records import BoolArray, IntArray, Landmarks
 class _PointRules(NamedTuple):
     """Which points are triangulated."""
 
-    min_disparity_px: float = 0.5
     steps: int = 8
     min_views: int = 2  # of a point
 
@@ -159,7 +158,7 @@ def triangulate_tracks(
     order = np.lexsort((disparity, tracks.point))
     last = np.searchsorted(tracks.point[order], np.arange(count), side="right") - 1
     best = order[last]
-    p_cam, valid = triangulate(camera, tracks.z[best], min_disparity_px=_POINTS.min_disparity_px)
+    p_cam, valid = triangulate(camera, tracks.z[best], min_disparity_px=DEPTH_DISPARITY_PX)
     valid &= tracks.has_right[best]
     p_cam = np.where(valid[:, None], p_cam, [0.0, 0.0, 1.0])
     start = T_world_cam0[tracks.keyframe[best]]

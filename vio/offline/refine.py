@@ -244,7 +244,7 @@ def _estimator_settings(path: Path) -> Config:
 class _PriorRules:
     """Which rows a prior of poses is made of."""
 
-    pose_steps: int = 12
+    max_pose_steps: int = 12
     min_rows: int = 6
     # of a prior: the first pose of a filter has no uncertainty by definition
     min_sigma_m: float = 1e-4
@@ -267,7 +267,7 @@ def align_to_points(
     """
     T_cam0_world = se3_inverse(T_world_cam0)
     weight = np.zeros(len(z))
-    for step in range(_PRIOR.pose_steps):
+    for step in range(_PRIOR.max_pose_steps):
         q = transform_points(T_cam0_world, p_world)
         ahead = q[:, 2] > MIN_DEPTH_M
         q = np.where(ahead[:, None], q, [0.0, 0.0, 1.0])

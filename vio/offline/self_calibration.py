@@ -67,7 +67,6 @@ class _RefinementRules:
     lens_direction_deg: float = 0.3
     held: float = 1e-9  # standard deviation of what is not free
     max_steps: int = 30  # of Levenberg-Marquardt
-    first_damping: float = 1e-4  # over the diagonal of the information
     min_damping: float = 1e-10
     max_damping: float = 1e4
     converged_share: float = 1e-6  # relative change of the cost
@@ -253,7 +252,7 @@ def _optimum(
     camera: StereoCamera, x: FloatArray, pieces: list[Segment], width: FloatArray
 ) -> tuple[FloatArray, list[Segment]]:
     """Return parameters (18,) and segments at the least robust cost, by Levenberg-Marquardt."""
-    damping = Damping(_REFINEMENT.first_damping, _REFINEMENT.max_damping, _REFINEMENT.min_damping)
+    damping = Damping(_REFINEMENT.max_damping, _REFINEMENT.min_damping)
     for _ in range(_REFINEMENT.max_steps):
         sigma = _spread(camera, x, pieces)
         before = _cost(camera, sigma, width, (x, pieces))

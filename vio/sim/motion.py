@@ -48,13 +48,13 @@ _CAR = _CarMotion()
 class _SmoothingRules:
     """How poses are smoothed to a spline."""
 
-    robust_rounds: int = 8
+    robust_steps: int = 8
     outlier_sigmas: float = 5.0
     outlier_floor: tuple[float, float] = (
         0.002,
         0.01,
     )  # m, rad: smaller residuals are smoothing, not outliers
-    rotation_rounds: int = 12
+    rotation_steps: int = 12
     rotation_tolerance_rad: float = 1e-10
 
 
@@ -204,7 +204,7 @@ def fit_spline(
         return distance, np.linalg.norm(so3_log(np.swapaxes(R, 1, 2) @ T[:, :3, :3]), axis=1)
 
     distance, angle = residuals()
-    for _ in range(_SMOOTHING.robust_rounds if robust else 0):
+    for _ in range(_SMOOTHING.robust_steps if robust else 0):
         good = (distance < _limit(distance[keep], _SMOOTHING.outlier_floor[0])) & (
             angle < _limit(angle[keep], _SMOOTHING.outlier_floor[1])
         )
@@ -262,7 +262,7 @@ def _fit(
     R_control: FloatArray = R[nearest]
     first = A.indices.reshape(-1, _K)[:, 0]
     weights = A.data.reshape(-1, _K)
-    for _ in range(_SMOOTHING.rotation_rounds):
+    for _ in range(_SMOOTHING.rotation_steps):
         residual = so3_log(np.swapaxes(_attitude(R_control, first, weights), 1, 2) @ R)
         delta = factor.solve(A.T @ residual)
         R_control = R_control @ so3_exp(delta)

@@ -46,7 +46,7 @@ class _WindowRules(NamedTuple):
     half_share: float = 0.5  # of a tag's or square's side
     half_sigmas: float = 2.0
     weight_share: float = 0.6  # of the half side: standard deviation of the weights
-    iterations: int = 12
+    max_steps: int = 12
     max_step_px: float = 1.5
     converged_px: float = 1e-3
     min_known_share: float = 0.3  # of a window's weight
@@ -141,7 +141,7 @@ class PrintAligner:
         shape = np.tile(np.eye(2), (len(uv), 1, 1))
         values = np.zeros_like(light)
         limit = max(0.5 * half, 1.0)
-        for _ in range(_WINDOW.iterations):
+        for _ in range(_WINDOW.max_steps):
             place = (at[:, None] + window @ np.swapaxes(shape, 1, 2)).astype(np.float32)
             sampled = cv2.remap(
                 image,

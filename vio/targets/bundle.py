@@ -35,7 +35,6 @@ class _Iterations(NamedTuple):
 
     max_steps: int = 60
     converged_share: float = 1e-6  # relative change of the cost
-    first_damping: float = 1e-4
     max_damping: float = 1e8
 
 
@@ -189,7 +188,7 @@ class BoardAdjustment:
         return np.asarray(A), np.asarray(-np.linalg.solve(A, B))
 
     def _descend(self, at: RigFit, steps: int, *, cut: bool) -> RigFit:
-        damping = Damping(_ITERATIONS.first_damping, _ITERATIONS.max_damping)
+        damping = Damping(_ITERATIONS.max_damping)
         for _ in range(steps):
             r = self._residuals(at)
             weight = self._weights(r, cut=cut)

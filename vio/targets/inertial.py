@@ -44,7 +44,6 @@ class _Iterations(NamedTuple):
     numeric_step: float = 1e-6
     term_step: float = 1e-4
     gauge_weight: float = 1e-9
-    first_damping: float = 1e-4
     max_damping: float = 1e6
 
 
@@ -257,7 +256,7 @@ class _Problem:
 
     def solve(self, at: _States) -> _States:
         """Return the optimum, by Levenberg-Marquardt."""
-        damping = Damping(_ITERATIONS.first_damping, _ITERATIONS.max_damping)
+        damping = Damping(_ITERATIONS.max_damping)
         before = np.inf
         for _ in range(_ITERATIONS.max_steps):
             steps = self._motions(at)
