@@ -300,7 +300,7 @@ def _keep_positive(out: FloatArray, P: FloatArray, count: int) -> None:
 
 def _diagonal(A: FloatArray) -> FloatArray:
     """Return the diagonal of a contiguous matrix (n, n), for changes in place."""
-    return A.reshape(-1)[:: len(A) + 1]
+    return A.ravel()[:: A.shape[0] + 1]
 
 
 def factor(P: FloatArray, first: int = 0) -> Factor:
