@@ -272,7 +272,7 @@ def replace_templates(store: Templates, slots: IntArray, wide: Patches) -> None:
     """Prepare templates from patches (N, 2r+3, 2r+3) in rows (N,) of others."""
     radius = wide.shape[1] // 2 - 1
     columns = _Columns(store.patch, store.gradient, store.energy, store.inverse)
-    _prepare(wide, _Disc(disc(radius), window(radius)), slots, columns, store.row_inverse)
+    _prepare(wide, _disc_of(radius), slots, columns, store.row_inverse)
 
 
 class _Disc(NamedTuple):
@@ -280,6 +280,12 @@ class _Disc(NamedTuple):
 
     xy: Pixels  # (2, S) as of `disc`
     weights: Pixels  # (S,) as of `window`
+
+
+@lru_cache(maxsize=8)
+def _disc_of(radius: int) -> _Disc:
+    """Return the pixels of a template with their weights."""
+    return _Disc(disc(radius), window(radius))
 
 
 class _Columns(NamedTuple):
@@ -414,7 +420,7 @@ def align(
     image = np.ascontiguousarray(image)
     _refine(
         columns,
-        _Disc(disc(radius), window(radius)),
+        _disc_of(radius),
         slots,
         (image, _pairs(image)),
         _RowPrior(expected, row_weight),

@@ -14,6 +14,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled, index_of
 from vio.records import BoolArray, Image, IntArray, TrackPrior
 
+_I3 = np.eye(3)
 _ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
 _MIN_DEPTH_M = 0.1
 _NEIGHBOURS = 3  # matched features whose median depth replaces an unknown one
@@ -21,7 +22,7 @@ _FAR_M = 1e6  # depth assumed where too few features have one
 
 
 def _is_rotation(R: FloatArray) -> bool:
-    return bool(np.isfinite(R).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_SLACK)
+    return bool(np.isfinite(R).all() and np.abs(R @ R.T - _I3).max() < _ROTATION_SLACK)
 
 
 def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:

@@ -35,7 +35,7 @@ class Tracks:
     skew: FloatArray  # (N, 2, 2) added to the linear part of the warp for the right image
 
     def __len__(self) -> int:
-        return len(self.ids)
+        return self.ids.size
 
 
 @dataclass(frozen=True, slots=True)

@@ -207,7 +207,7 @@ class Observations:
             )
 
     def __len__(self) -> int:
-        return len(self.ids)
+        return self.ids.size
 
     def take(self, index: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Observations:
         """Return the rows named by a mask (N,) or by indices (K,); the record itself where a
@@ -227,8 +227,14 @@ def shared_rows(ids: IntArray, other: IntArray) -> tuple[IntArray, IntArray]:
     """Return the rows (K,) of the features that two frames share, in the one and in the other, in
     the order of their ids; the ids (N,) and (M,) of a frame are unique.
     """
-    _, rows, others = np.intersect1d(ids, other, assume_unique=True, return_indices=True)
-    return rows, others
+    rows = ids.argsort()
+    others = other.argsort()
+    place = other[others].searchsorted(ids[rows])
+    inside = place < others.size
+    rows = rows[inside]
+    others = others[place[inside]]
+    same = ids[rows] == other[others]
+    return rows[same], others[same]
 
 
 def observations(

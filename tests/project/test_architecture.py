@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.dataset_makers import make_kitti
 from tools.draw_structure import layers, read_packages
 from tools.parts import ORDER, PARTS, part_of, read_edges, source_files, wrong_way
 
@@ -371,6 +372,14 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
     assert used - {"numba"} <= found, "which shows that the test can fail"
     assert not found & UNUSED_BY_A_SHORT_RUN
     assert compiling or not found & UNUSED_WITH_MACHINE_CODE
+
+
+def test_kitti_is_read_without_the_readers_of_other_calibrations(tmp_path: Path) -> None:
+    folder = make_kitti(tmp_path / "seq", frames=2)
+    code = f"import vio.datasets\nvio.datasets.open_dataset({str(folder)!r})"
+    formats = {"vio.datasets.rigs.formats", "vio.datasets.rigs.basalt", "vio.datasets.rigs.opencv"}
+    used = "vio.datasets.rigs.kitti_odometry"
+    assert _loaded(code, {*formats, used}) == {used}, "which shows that the test can fail"
 
 
 def test_no_print_or_exit_outside_the_command_line() -> None:

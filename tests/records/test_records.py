@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vio.errors import DataError
-from vio.records import Trajectory, feature_tracks, observations
+from vio.records import Trajectory, feature_tracks, observations, shared_rows
 
 
 def test_frames_come_back_out_of_the_table_and_missing_ones_are_empty() -> None:
@@ -35,6 +35,15 @@ def test_observations_that_contradict_themselves_are_refused() -> None:
         observations(0, 0, [1, 2], [[1, 2, 3, 4]])
     with pytest.raises(DataError, match="frame 5: an id occurs twice among 3 observations"):
         observations(5, 0, [1, 2, 1], np.zeros((3, 4)))
+
+
+def test_shared_rows_are_those_of_the_common_ids_in_their_order() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        ids, other = (rng.permutation(30)[: rng.integers(0, 20)] for _ in range(2))
+        rows, others = shared_rows(ids, other)
+        common = sorted(set(ids.tolist()) & set(other.tolist()))
+        assert ids[rows].tolist() == other[others].tolist() == common
 
 
 def test_a_trajectory_is_moved_to_the_other_frame_once() -> None:

@@ -90,7 +90,8 @@ class _FitRules(NamedTuple):
 
     # of numeric derivatives by the parameters, which are all of the size of radians
     step_rad: float = 1e-6
-    steps: int = 15  # of Gauss-Newton; the weights of the prior need most of them
+    max_steps: int = 15  # of Gauss-Newton; the weights of the prior need them
+    settled_sigmas: float = 1e-4  # standard deviations of a step after which there is no other
 
 
 _FIT = _FitRules()
@@ -325,16 +326,18 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     x = np.zeros(len(PARAMETERS))
     J = np.zeros((TERMS, len(PARAMETERS)))
     information = np.diag(1 / _PRIOR**2)
-    for round_ in range(_FIT.steps):
+    for round_ in range(_FIT.max_steps):
         prior = np.diag(1 / (_PRIOR**2 + x**2))
+        shown = frame.coefficients(x)
         for k in np.flatnonzero(free & (round_ in _LINEARISED)):
-            step = _FIT.step_rad * np.eye(len(PARAMETERS))[k]
-            J[:, k] = (frame.coefficients(x + step) - frame.coefficients(x - step)) / (
-                2 * _FIT.step_rad
-            )
+            moved = x + _FIT.step_rad * np.eye(len(PARAMETERS))[k]
+            J[:, k] = (frame.coefficients(moved) - shown) / _FIT.step_rad
         information = J.T @ W @ J + prior
-        gradient = J.T @ W @ (measured - frame.coefficients(x)) - prior @ x
-        x = x + np.linalg.solve(information, gradient * free)
+        gradient = J.T @ W @ (measured - shown) - prior @ x
+        step = np.linalg.solve(information, gradient * free)
+        x = x + step
+        if round_ > _LINEARISED[-1] and step @ information @ step < _FIT.settled_sigmas**2:
+            break
     covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     seen = frame.as_seen(x)
     left = seen - frame.grid - error_basis(frame.camera, frame.where_read(seen)) @ measured

@@ -43,6 +43,7 @@ from vio.datasets.reader import Reader
 from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.rigs.eth3d import FOLDERS as ETH3D_FOLDERS
 from vio.datasets.rigs.eth3d import is_eth3d
+from vio.datasets.rigs.names import named_calibration
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.sides import first_pair, pairs_of, split_sides
 from vio.datasets.tables import drive_times
@@ -221,7 +222,8 @@ def holds_more_than_kitti(path: Path) -> bool:
         return False
     if imu_files(path):
         return True
-    return rigs.find_calibration(path) not in (None, path / "calib.txt")
+    found = named_calibration(path) or rigs.find_calibration(path)
+    return found not in (None, path / "calib.txt")
 
 
 def lacks_sensor_yaml(path: Path) -> bool:

@@ -325,6 +325,6 @@ def usable_points(
     )
     limits = DepthLimits(*variances, _TRIANGULATION.tiny, _TRIANGULATION.disparity_information)
     room = InverseDepth.empty(1)
-    seen = at._replace(weight=views.weight)
+    seen = Residuals(at.r, at.z_D_p, at.ahead, views.weight)
     loops.mark_usable(_cameras(camera, T_cam0_world), p_world, seen, limits, room, keep)
     return keep

@@ -368,7 +368,7 @@ class ImuMotion:
         error.
         """
         # v = exp(phi) v_hat + xi_v
-        velocity_D_error = np.concatenate([-so3_hat(nav.velocity), np.eye(3)], axis=1)
+        velocity_D_error = np.concatenate([-so3_hat(nav.velocity), _I3], axis=1)
         sigmas = np.sqrt(np.diag(P)[9:15])
         return MotionUncertainty(
             velocity_D_error @ P[3:9, 3:9] @ velocity_D_error.T, sigmas[:3], sigmas[3:]

@@ -80,9 +80,14 @@ class Overdispersion:
         for k, (feature, (x, y)) in enumerate(zip(ids.tolist(), cells, strict=True)):
             cluster = x, y, self._calls // _CLUSTERS.frames
             if feature in self._cluster:  # a feature that began again stays in its cluster
-                cluster = self._cluster.pop(feature)
+                cluster = self._cluster[feature]
+                del self._cluster[feature]
             self._cluster[feature] = cluster
-            row = self._row.pop(cluster) if cluster in self._row else self._free.pop()
+            if cluster in self._row:
+                row = self._row[cluster]
+                del self._row[cluster]
+            else:
+                row = self._free.pop()
             rows[k] = self._row[cluster] = row
         loops.add_scores(rows, scores, self._scores, self._squares)
         self._calls += 1

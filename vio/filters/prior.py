@@ -15,7 +15,7 @@ from vio.dataclass import dataclass
 from vio.filters import pose_loops as loops
 from vio.filters.scale_test import ScaleTest
 from vio.geometry.lie import FloatArray
-from vio.numerics.scipy_extensions import blas, lapack
+from vio.numerics.scipy_extensions import lapack
 from vio.records import IntArray
 
 _SINGULAR = 1e-12  # of the largest eigenvalue of a matrix of correlations
@@ -265,7 +265,7 @@ class Fit:
     def whitened(self, J_L: FloatArray) -> FloatArray:
         """Return S (..., k, n) with `S S'` the covariance of `J error`, from `J L` (..., k, n)."""
         rows = np.ascontiguousarray(J_L).reshape(-1, J_L.shape[-1])
-        S: FloatArray = blas.dtrsm(1.0, self.K_transposed, rows.T, lower=0, trans_a=1).T
+        S: FloatArray = lapack.dtrtrs(self.K_transposed, rows.T, trans=1)[0].T
         return S.reshape(J_L.shape)
 
     def covariance(self) -> FloatArray:
@@ -278,11 +278,11 @@ class Fit:
         P = self.prior.P
         L = self.prior.L
         first = self.prior.first
-        W = blas.dtrsm(1.0, self.K_transposed, L.T, lower=0, trans_a=1)
+        W, _ = lapack.dtrtrs(self.K_transposed, L.T, trans=1)
         out: FloatArray = np.empty(P.shape)
         out[first:, first:] = W.T @ W
         if first:
-            G: FloatArray = blas.dtrsm(1.0, L.T, P[:first, first:].T, lower=0, trans_a=1).T
+            G: FloatArray = lapack.dtrtrs(L.T, P[:first, first:].T, trans=1)[0].T
             N = self.whitened(G)
             out[:first, first:] = N @ W
             out[first:, :first] = out[:first, first:].T
@@ -300,7 +300,7 @@ def _keep_positive(out: FloatArray, P: FloatArray, count: int) -> None:
 
 def _diagonal(A: FloatArray) -> FloatArray:
     """Return the diagonal of a contiguous matrix (n, n), for changes in place."""
-    return A.reshape(-1)[:: len(A) + 1]
+    return A.ravel()[:: A.shape[0] + 1]
 
 
 def factor(P: FloatArray, first: int = 0) -> Factor:

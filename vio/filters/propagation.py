@@ -101,6 +101,7 @@ class _Coming:
 
 
 _I3 = np.eye(3)
+_I6 = np.eye(6)
 _POSE = np.eye(6, DIM)  # the pose of a navigation state
 _NOTHING = FramePosterior(np.zeros((DIM, DIM)), np.zeros((DIM + 6, DIM + 6)), np.eye(4))
 
@@ -296,7 +297,7 @@ class Propagation:
                 M = growth.Phi[:6] - _POSE
                 moved = M @ self.posterior.own[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
             else:
-                M = np.concatenate([J @ self.grown(window, nav, growth), -np.eye(6)], axis=1)
+                M = np.concatenate([J @ self.grown(window, nav, growth), -_I6], axis=1)
                 moved = M @ self.posterior.with_newest @ M.T + J[:, :DIM] @ growth.Q @ J[:, :DIM].T
             last = self._camera = nav, growth, late_s, (T, J, moved)
         T, J, moved = last[3]

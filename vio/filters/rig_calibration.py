@@ -244,7 +244,7 @@ class RigCalibration:
     def reported_uncertainty(self, window: Window, V: FloatArray) -> FloatArray:
         """Return `uncertainty` (k, k) with what sensor and field say against the scale."""
         by_scale = V[:, 0] * self.scale_doubt(window)
-        return self.uncertainty(window, V) + np.outer(by_scale, by_scale)
+        return self.uncertainty(window, V) + by_scale[:, None] * by_scale
 
     def landmark_covariances(self, window: Window) -> FloatArray:
         """Covariances (M, 3, 3) of the landmarks in the state, with what is considered."""

@@ -53,7 +53,7 @@ class Clones:
     velocities: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3)
 
     def __len__(self) -> int:
-        return len(self.times_ns)
+        return self.times_ns.size
 
     def __getitem__(self, index: int) -> Clone:
         number = int(self.frame_indices[index])
@@ -85,6 +85,7 @@ class Clones:
         )
 
 
+_I3 = np.eye(3)
 _NO_CALIBRATION = Calibration(np.eye(4))
 
 
@@ -219,7 +220,7 @@ class Window:
         if "first_attitude" in self.state:
             out_D_error = out_D_error.copy()
             rows = out_D_error.reshape(-1, 6, out_D_error.shape[1])
-            rows[:, 3:, self.state["first_attitude"]] -= np.eye(3)
+            rows[:, 3:, self.state["first_attitude"]] -= _I3
         return out_D_error
 
     @property
@@ -499,7 +500,7 @@ class Window:
         V = self.prior.error_D_constants
         V[rows, 1] += moved.reshape(-1)
         axis = self.T_cam0_world(-1)[0, 2, :3]
-        V[rows, 2] += np.outer(moved @ axis, axis).reshape(-1)
+        V[rows, 2] += ((moved @ axis)[:, None] * axis).reshape(-1)
 
     def turn_world(self, yaw: float, yaw_D_tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Turn the whole world about its z axis, and let the errors' yaw hang on the present tilt,

@@ -165,7 +165,7 @@ def given(P: FloatArray, rows: slice) -> FloatArray:
     known = P[rows, rows]
     scale = np.sqrt(known.diagonal())
     scale[scale == 0] = np.inf  # known already
-    values, vectors = np.linalg.eigh(known / np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(known / (scale[:, None] * scale))
     independent = values > _GIVEN_RANK
     half = (vectors[:, independent] / np.sqrt(values[independent])).T @ (P[rows] / scale[:, None])
     out: FloatArray = P - half.T @ half

@@ -53,9 +53,7 @@ def _alone(package: str, full_name: str) -> ModuleType | None:
 
 _PUBLIC = {
     "_flapack": "scipy.linalg.lapack",
-    "_fblas": "scipy.linalg.blas",
     "_special_ufuncs": "scipy.special",
 }
 lapack = _extension("linalg", "_flapack", ("dpotrf", "dpotrs", "dpstrf", "dsygst", "dtrtrs"))
-blas = _extension("linalg", "_fblas", ("dtrsm",))
 special = _extension("special", "_special_ufuncs", ("gammainc", "gammaincinv"))

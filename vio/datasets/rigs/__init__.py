@@ -8,13 +8,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from vio.datasets.rigs.formats import find_calibration, kitti_rig, load_rig
+    from vio.datasets.rigs.formats import find_calibration, load_rig
+    from vio.datasets.rigs.kitti_odometry import kitti_rig
 
 __all__ = ["find_calibration", "kitti_rig", "load_rig"]
 
+_MODULES = {  # loaded when the name is first used: `formats` loads the readers of all formats
+    "find_calibration": "formats",
+    "kitti_rig": "kitti_odometry",
+    "load_rig": "formats",
+}
+
 
 def __getattr__(name: str) -> object:
-    """Load a public name with the readers of all formats, when it is first used."""
-    if name not in __all__:
+    """Load a public name when it is first used."""
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module("vio.datasets.rigs.formats"), name)
+    return getattr(import_module(f"vio.datasets.rigs.{_MODULES[name]}"), name)

@@ -15,7 +15,6 @@ import numpy as np
 from vio.cameras.rig import Rig
 from vio.datasets.common import naming
 from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
-from vio.datasets.kitti import read_calibration, read_extrinsics
 from vio.datasets.kitti_raw import (
     CAMERAS,
     PERSPECTIVE,
@@ -45,20 +44,19 @@ from vio.datasets.rigs.camera_info import (
 from vio.datasets.rigs.four_seasons import is_four_seasons, read_four_seasons
 from vio.datasets.rigs.kalibr import is_camchain, read_camchain
 from vio.datasets.rigs.kimera import pair_beside, read_kimera
+from vio.datasets.rigs.kitti_odometry import kitti_rig
+from vio.datasets.rigs.names import named_calibration
 from vio.datasets.rigs.opencv import is_opencv, read_entries, rig_from_opencv
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import Source
 from vio.datasets.sides import side_word
 from vio.datasets.yaml_files import Entries, read_json_file
 from vio.errors import CalibrationError, DataError
-from vio.files.text import text_lines
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.geometry.lie import se3_from_parts, se3_inverse
 
-__all__ = ["find_calibration", "kitti_rig", "load_rig"]
+__all__ = ["find_calibration", "load_rig"]
 
 Size = tuple[int, int]
-# by which KITTI's right camera may be off the left one's x axis before it is noted
-_OFF_AXIS_NOTE_M = 1e-3
 
 KNOWN = (
     "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt "
@@ -66,13 +64,6 @@ KNOWN = (
     "right.yaml, or BoofCV's stereo.xml; or the settings of ORB-SLAM, VINS, OKVIS, Kimera or SVO, "
     "Basalt's, Monado's or DepthAI's JSON, or a ZED's SN*.conf"
 )
-# File names looked for in a folder, in this order; the content decides what they are.
-_IN_FOLDER = (
-    "calibration.yaml", "calibration.yml", "camchain-imucam*.yaml", "*camchain-imucam*.yaml", "camchain*.yaml",
-    "*camchain*.yaml", "*imucam_chain*.y*ml", "calib_cam_to_cam.txt", "perspective.txt", "calib.txt", "left.y*ml",
-    "stereo*.y*ml", "intrinsics.y*ml", "stereo*.xml", "calibration.xml", "calib.xml", "calib.y*ml",
-    "calibration.json", "calib.json", "SN*.conf", "undistorted_calib_0.txt", *bare.NAMES,
-)  # fmt: skip
 _OTHERS = (".yaml", ".yml", ".json", ".xml", ".conf")  # whose content decides in any folder
 _MAX_OTHERS = 40  # files looked into; a folder with more is no recording's
 # whether entries are of a format, and what reads it; the first that fits does
@@ -138,12 +129,8 @@ def find_calibration(folder: Path) -> Path | None:
     Usual names go first; else the content of the files there decides, that of a pair before that
     of one camera.
     """
-    for mav in (folder / "mav0", folder):
-        if (mav / "cam0" / "sensor.yaml").is_file():
-            return mav / "cam0" / "sensor.yaml"
-    for pattern in _IN_FOLDER:
-        if found := sorted(file for file in folder.glob(pattern) if file.is_file()):
-            return found[0]
+    if (named := named_calibration(folder)) is not None:
+        return named
     pair = pair_of_files(folder)
     return _by_content(folder) if pair is None else pair[0]
 
@@ -274,43 +261,6 @@ def _euroc(source: Source) -> Rig:
     T_cam1_cam0 = se3_inverse(T_imu_cam1) @ T_imu_cam0
     with naming(mav):
         return checked_rig(Rig(cam0, cam1, T_cam1_cam0, se3_inverse(T_imu_cam0), noise), mav)
-
-
-def kitti_rig(
-    path: Path, image_size: Size | None, cameras: tuple[int, int] | None = None
-) -> tuple[Rig, FloatArray]:
-    """Return KITTI's `calib.txt`, with `T_cam0_imu.txt` beside it, and `T_left_cam0` (4, 4) from
-    KITTI's camera 0.
-
-    Args:
-        path: the file.
-        image_size: width and height of the images, pixels.
-        cameras: numbers of the left and the right one; None: the gray pair, else that in colour.
-
-    Raises:
-        CalibrationError: a file is invalid, or no image size is given.
-    """
-    if cameras is None:
-        cameras = (0, 1) if any(line.startswith("P0:") for _, line in text_lines(path)) else (2, 3)
-    calibration = read_calibration(path, cameras)
-    if image_size is None:
-        raise CalibrationError(f"{path}: states no image size; pass image_size=(W, H)")
-    c = calibration.camera
-    T_cam0_imu = read_extrinsics(path.with_name("T_cam0_imu.txt"))
-    T_left_imu = None if T_cam0_imu is None else calibration.T_left_cam0 @ T_cam0_imu
-    with naming(path):
-        rig = Rig.rectified(
-            c.fu, c.fv, c.cu, c.cv, c.baseline_m, *image_size, T_cam0_imu=T_left_imu
-        )
-    if calibration.off_axis_m > _OFF_AXIS_NOTE_M:
-        off_axis = (
-            f"is {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of image_{cameras[0]}"
-        )
-        note = (
-            f"the camera of image_{cameras[1]} {off_axis}; the pair is treated as rectified anyway"
-        )
-        rig = rig.noting(note)
-    return checked_rig(rig, path, size_stated=False), calibration.T_left_cam0
 
 
 def _kitti_raw(path: Path, image_size: Size | None) -> Rig:
