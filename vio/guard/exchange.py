@@ -150,10 +150,10 @@ class ExchangeDetector(ImageCheck):
         return unlike or sum(own) > sum(other)
 
     def _left_is_left(self, now: tuple[Image, Image]) -> bool:
-        """Whether the left image is clearly the next one of the left camera: then disparities are
-        negative as the right camera has turned.
+        """Whether the left image is clearly the next one of the left camera, after one in order: then
+        disparities are negative as the right camera has turned.
         """
-        if self._last is None:
+        if self._last is None or self._since is not None:
             return False
         own, other = (image_change(now[0], last) for last in self._last)
         return own < _EXCHANGE.own_share * other
