@@ -324,6 +324,7 @@ def run_tests(copy: Path, tests: Sequence[str], *options: str) -> tuple[list[str
         **os.environ,
         "PYTHONPATH": str(copy),
         "VIO_DATA": data,
+        "VIO_SAME_RESULTS": "1",
         "VIO_TEST_MACHINE_CODE": "1",  # what a mutation changes is compiled anew
     }
     # The process that tests says which packages it would test.

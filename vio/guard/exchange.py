@@ -41,9 +41,11 @@ class _ExchangeRules:
     # share of them above which a frame that looks exchanged is refused: its rows do not fit when
     # put back
     refused_share: float = 0.2
-    # change of a left image since the left camera's last one, over that since the right one's, at
-    # most, of one that is not exchanged; exchanged ones have 0.9 and more
+    # A left image is the left camera's if its change since that one's last image is less than a share
+    # of that since the right one's, and this more than motion explains: so many times what the images
+    # of the pair before have changed by. None of 900 exchanged pairs, of slow and fast motion, is so.
     own_share: float = 0.8
+    motion: float = 1.4
 
 
 _EXCHANGE = _ExchangeRules()
@@ -66,6 +68,7 @@ class ExchangeDetector(ImageCheck):
         self._probe = probe
         # left and right, sparsely sampled, in their right order
         self._last: tuple[Image, Image] | None = None
+        self._usual_change = 0.0  # of the last two images since those before
         self._since: int | None = None  # first frame of a run of exchanged ones
         # disparities are negative, and were so in a frame whose left image was the left camera's
         self._right_turned = False
@@ -137,7 +140,11 @@ class ExchangeDetector(ImageCheck):
             if self._right_turned:
                 order = "given"
         if order != "refused":
-            self._last = now if order == "given" else now[::-1]
+            ordered = now if order == "given" else now[::-1]
+            if self._last is not None:
+                # that of the other one is larger where its camera has turned
+                self._usual_change = min(map(image_change, ordered, self._last))
+            self._last = ordered
         self._report(index, order)
         return order
 
@@ -156,7 +163,7 @@ class ExchangeDetector(ImageCheck):
         if self._last is None or self._since is not None:
             return False
         own, other = (image_change(now[0], last) for last in self._last)
-        return own < _EXCHANGE.own_share * other
+        return own < _EXCHANGE.own_share * other and other > _EXCHANGE.motion * self._usual_change
 
     def _report(self, index: int, order: Order) -> None:
         if order == "given":
