@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,6 +32,7 @@ from vio.guard.turned_pair import TurnedPair, turned_back
 from vio.offline.run_images import run_images
 from vio.protocols import Dataset
 from vio.records import FrontendOutput, Image, StereoFrame
+from vio.runs.checkpoint import load_checkpoint, save_checkpoint
 from vio.runs.folder import write_run_folder
 from vio.runs.pipeline import RunResult, run
 from vio.sim.export import export_euroc
@@ -151,6 +154,23 @@ def test_a_rig_at_standstill_is_waited_for_and_then_judged_by_its_rows() -> None
     (finding,) = [f for o in outputs for f in o.findings if f.code == "right-camera-turned"]
     assert angles_deg(finding)[2] == pytest.approx(1.0, abs=0.05)
     assert finding.frame == 25  # 20 frames without motion, and six pairs
+
+
+def test_a_checkpoint_amid_the_pairs_goes_on_to_the_same_rotation(tmp_path: Path) -> None:
+    def fed(check: TurnedPair, given: list[StereoFrame]) -> TurnedPair:
+        for frame in given:
+            images = images_of(frame, pair=True)
+            assert images is not None
+            check.inspect(images)
+        return check
+
+    given = turned(ROLLED, 1.2)
+    check = fed(TurnedPair(CAMERA, RowProbe()), given[:3])
+    source: Any = SimpleNamespace(observations=None)
+    save_checkpoint(tmp_path / "state", check, source)
+    again = fed(load_checkpoint(tmp_path / "state", source), given[3:])
+    np.testing.assert_array_equal(again.rotation, fed(check, given[3:]).rotation)
+    assert again.rotation is not None
 
 
 def test_one_camera_and_cylinders_have_no_such_check() -> None:
