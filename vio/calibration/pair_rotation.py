@@ -2,10 +2,10 @@
 that were matched without regard to rows.
 
 A rotation `exp(w)`, by which a right camera shows the points p of its rectified frame, moves all
-right pixels. About the axes x and z it moves rows by several pixels a tenth of a degree, whatever the
-depth: a single pair tells both. About y it moves rows by `x y w_y`, which a tangential distortion p2
-does as well, equation (R2) of docs/math.md, and all disparities by the same number of pixels: only
-motion tells it from depth. So the yaw comes from two pairs between which the rig has moved.
+right pixels. About the axes x and z it moves rows by several pixels a tenth of a degree, whatever
+the depth: a single pair tells both. About y it moves rows by `x y w_y`, which a tangential
+distortion p2 does as well, equation (R2) of docs/math.md, and all disparities by the same number of
+pixels: only motion tells it from depth. So the yaw comes from two pairs between which the rig has moved.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, so3_exp
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import StereoCamera, left_rays
 from vio.numerics.robust import robust_sigma
 from vio.records import BoolArray
 
@@ -42,11 +42,11 @@ class _Fit(NamedTuple):
 
 
 _FIT = _Fit()
-# Of a rotation. Calibrations of real recordings have at most 0.06 about x and z, and 0.2 about y: four
-# of the standard deviations that the filter takes for it (`msckf.stereo_yaw_sigma_deg`).
+# Of a rotation. Calibrations of real recordings have at most 0.06 about x and z, and 0.2 about y:
+# four of the standard deviations that the filter takes for it (`msckf.stereo_yaw_sigma_deg`).
 MIN_TURN_DEG = 0.2
-# of one about y by rows alone: a right lens whose tangential distortion is off looks like 0.6 degrees
-# in all rows of KITTI
+# of one about y by rows alone: a right lens whose tangential distortion is off looks like 0.6
+# degrees in all rows of KITTI
 MIN_ROW_YAW_DEG = 0.9
 _SHARED = 10  # unknowns of two pairs: rotation, p2, and the motion's rotation and translation
 _PIXELS = 8  # of a point in two pairs
@@ -94,8 +94,8 @@ def rotation_by_rows(camera: StereoCamera, z: FloatArray) -> PairRotation | None
     """
     if len(z) < _FIT.min_points:
         return None
-    rows = _normalised(camera, z)[:, 1]
-    rays = _rays(camera, z[:, 2:])
+    rows = left_rays(camera, z[:, :2])[:, 1]
+    rays = left_rays(camera, z[:, 2:])  # both cameras have the same intrinsics
 
     def off(w: FloatArray) -> FloatArray:
         return camera.fv * (_undone(rays, w, 0.0)[:, 1] - rows)
@@ -165,19 +165,6 @@ def _adjusted(seen: _SeenTwice, shared: FloatArray, count: int) -> PairRotation 
     return PairRotation(shared[:3], covariance, int(agree.sum()), float(agree.sum() / count))
 
 
-def _normalised(camera: StereoCamera, z: FloatArray) -> FloatArray:
-    """Return pixels (N, 4) in focal lengths from the principal point."""
-    centre = np.array([camera.cu, camera.cv, camera.cu, camera.cv])
-    focal = np.array([camera.fu, camera.fv, camera.fu, camera.fv])
-    return np.asarray((z - centre) / focal, dtype=np.float64)
-
-
-def _rays(camera: StereoCamera, pixels: FloatArray) -> FloatArray:
-    """Return rays (N, 3) of unit depth of pixels (N, 2)."""
-    x = _normalised(camera, np.hstack([pixels, pixels]))[:, :2]
-    return np.hstack([x, np.ones((len(x), 1))])
-
-
 def _undone(rays: FloatArray, rotation: FloatArray, p2: float) -> FloatArray:
     """Return where a right camera as calibrated shows rays (N, 3) of one that is turned and has
     tangential distortion p2: (N, 2), focal lengths.
@@ -201,8 +188,8 @@ class _SeenTwice:
     def __init__(self, camera: StereoCamera, first: FloatArray, second: FloatArray) -> None:
         self._camera = camera
         self._pixels = (first, second)
-        self._left = tuple(_normalised(camera, z)[:, :2] for z in (first, second))
-        self._rays = tuple(_rays(camera, z[:, 2:]) for z in (first, second))
+        self._left = tuple(left_rays(camera, z[:, :2])[:, :2] for z in (first, second))
+        self._rays = tuple(left_rays(camera, z[:, 2:]) for z in (first, second))
 
     def take(self, rows: BoolArray) -> _SeenTwice:
         """Return some of the points, by a mask (N,)."""

@@ -11,7 +11,7 @@ camera that has turned, but its left image is like the last one of the left came
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -41,9 +41,10 @@ class _ExchangeRules:
     # share of them above which a frame that looks exchanged is refused: its rows do not fit when
     # put back
     refused_share: float = 0.2
-    # A left image is the left camera's if its change since that one's last image is less than a share
-    # of that since the right one's, and this more than motion explains: so many times what the images
-    # of the pair before have changed by. None of 900 exchanged pairs, of slow and fast motion, is so.
+    # A left image is the left camera's if its change since that one's last image is less than a
+    # share of that since the right one's, and this more than motion explains: so many times what
+    # the images of the pair before have changed by. None of 900 exchanged pairs, of slow and fast
+    # motion, is so.
     own_share: float = 0.8
     motion: float = 1.4
 
@@ -58,6 +59,30 @@ class MatchCounts:
     points: int
     positive: int
     negative: int
+
+
+class _Changes(NamedTuple):
+    """Changes of the left and the right image since the last ones of both cameras."""
+
+    own: tuple[float, float]  # since its own camera's
+    other: tuple[float, float]  # since the other one's
+
+    @classmethod
+    def between(cls, now: tuple[Image, Image], last: tuple[Image, Image]) -> _Changes:
+        """Return those of images since the last ones."""
+        left, right = now
+        return cls(
+            (image_change(left, last[0]), image_change(right, last[1])),
+            (image_change(left, last[1]), image_change(right, last[0])),
+        )
+
+    def look_exchanged(self) -> bool:
+        """Whether each image is rather like the other camera's last one."""
+        own = self.own
+        other = self.other
+        # The motion shifts both images alike; or it shifts them by less than the disparity does.
+        unlike = abs(own[0] - own[1]) > abs(other[0] - other[1])
+        return unlike or sum(own) > sum(other)
 
 
 class ExchangeDetector(ImageCheck):
@@ -127,42 +152,35 @@ class ExchangeDetector(ImageCheck):
                 each other.
         """
         now: tuple[Image, Image] = (_thumbnail(left), _thumbnail(right))
+        changes = None if self._last is None else _Changes.between(now, self._last)
         order: Order = "given"
         if (
             suspicious
             or self._since is not None
-            or (self._last is not None and self._looks_exchanged(now))
+            or (changes is not None and changes.look_exchanged())
         ):
             order = _judge(count(), "given" if self._since is None else "exchanged")
             self._right_turned = order != "given" and (
-                self._right_turned or self._left_is_left(now)
+                self._right_turned or self._left_is_left(changes)
             )
             if self._right_turned:
                 order = "given"
         if order != "refused":
-            ordered = now if order == "given" else now[::-1]
-            if self._last is not None:
-                # that of the other one is larger where its camera has turned
-                self._usual_change = min(map(image_change, ordered, self._last))
-            self._last = ordered
+            self._last = now if order == "given" else now[::-1]
+            if changes is not None:
+                # that of the other image is larger where its camera has turned
+                self._usual_change = min(changes.own if order == "given" else changes.other)
         self._report(index, order)
         return order
 
-    def _looks_exchanged(self, now: tuple[Image, Image]) -> bool:
-        assert self._last is not None
-        own = [image_change(a, b) for a, b in zip(now, self._last, strict=True)]
-        other = [image_change(a, b) for a, b in zip(now, self._last[::-1], strict=True)]
-        # The motion shifts both images alike; or it shifts them by less than the disparity does.
-        unlike = abs(own[0] - own[1]) > abs(other[0] - other[1])
-        return unlike or sum(own) > sum(other)
-
-    def _left_is_left(self, now: tuple[Image, Image]) -> bool:
-        """Whether the left image is clearly the next one of the left camera, after one in order: then
-        disparities are negative as the right camera has turned.
+    def _left_is_left(self, changes: _Changes | None) -> bool:
+        """Whether the left image is clearly the next one of the left camera, after one in order:
+        then disparities are negative as the right camera has turned.
         """
-        if self._last is None or self._since is not None:
+        if changes is None or self._since is not None:
             return False
-        own, other = (image_change(now[0], last) for last in self._last)
+        own = changes.own[0]
+        other = changes.other[0]
         return own < _EXCHANGE.own_share * other and other > _EXCHANGE.motion * self._usual_change
 
     def _report(self, index: int, order: Order) -> None:

@@ -36,8 +36,8 @@ def image_checks(camera: StereoCamera) -> tuple[ImageCheck, ...]:
     """Return the checks of the images of a camera, in their order.
 
     A frozen image looks as if it were the other camera's, so that is asked first. So do images of two
-    times, and are paired anew before they could be exchanged. All of these search along rows, which a
-    turned camera does not have.
+    times, and are paired anew before they could be exchanged. All of these search along rows, which
+    a turned camera does not have.
     """
     if camera.kind != "stereo":
         return (LostContrast(),)

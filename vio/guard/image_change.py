@@ -12,6 +12,8 @@ from vio.records import Image
 _CONTRAST = 50.0
 _CLIPPED = 250  # gray level from which a pixel of a resampled image may contain clipped ones
 _MIN_UNCLIPPED = 0.1  # share of the pixels
+_MIN_MOVED = 2.0  # gray levels at the common contrast, of an image after a motion
+_STRIDE = 4  # of the pixels of half images that are compared for it
 
 
 def image_change(image: Image, other: Image) -> float:
@@ -22,6 +24,11 @@ def image_change(image: Image, other: Image) -> float:
     clips others.
     """
     return float(_CONTRAST * _change(image, other))
+
+
+def has_moved(half: Image, before: Image) -> bool:
+    """Whether the camera has moved between two of its images (H/2, W/2) at half resolution."""
+    return image_change(half[::_STRIDE, ::_STRIDE], before[::_STRIDE, ::_STRIDE]) >= _MIN_MOVED
 
 
 @compiled

@@ -23,7 +23,7 @@ from typing import NamedTuple
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.guard.image_change import image_change
+from vio.guard.image_change import has_moved
 from vio.guard.image_check import FrameImages, ImageCheck, images_of
 from vio.guard.probe import RowProbe
 from vio.records import Image, IntArray, StereoFrame
@@ -36,9 +36,6 @@ class _PairingRules(NamedTuple):
     alike_frames: int = 2  # frames in a row after which the counts so far tell the same
     max_tests: int = 40  # frames in which the rig moves, after which the pairing counts as right
     min_points: int = 30  # corners in a frame
-    # of the left image since the last frame, gray levels at the common contrast
-    min_change: float = 2.0
-    stride_px: int = 4  # of the pixels that are compared
     max_delay_frames: int = 3  # frames that images of a pair may be apart
     min_share: float = 0.4  # of the corners that match in the best pairing
     clear_factor: float = 1.3  # times as many as in both others
@@ -121,13 +118,7 @@ class PairingCheck(ImageCheck):
         left, right = images.halves
         now = _Halves(left.copy(), right.copy(), self._probe)
         last = self._last
-        moved = last is None or (
-            image_change(
-                left[:: _PAIRING.stride_px, :: _PAIRING.stride_px],
-                last.left[:: _PAIRING.stride_px, :: _PAIRING.stride_px],
-            )
-            >= _PAIRING.min_change
-        )
+        moved = last is None or has_moved(left, last.left)
         if moved:
             self._last = now
         if moved and last is not None:

@@ -61,15 +61,15 @@ class Repair:
         if self.turn is not None:
             angles = ", ".join(f"{angle:+.2f}" for angle in np.degrees(self.turn))
             line = (
-                f"the right camera is turned against its calibration, by {angles} degrees about x, y "
-                "and z; the run began again with its images turned back; calibrate anew (vio "
+                f"the right camera is turned against its calibration, by {angles} degrees about "
+                "x, y and z; the run began again with its images turned back; calibrate anew (vio "
                 "calibrate)"
             )
             out.append(("right-turn-put-right", line))
         if self.delay:
             line = (
-                f"{late_text(self.delay)}; the run began again with the right pairs; pair the images "
-                "by their times of exposure"
+                f"{late_text(self.delay)}; the run began again with the right pairs; pair the "
+                "images by their times of exposure"
             )
             out.append(("pairs-put-right", line))
         return tuple(out)

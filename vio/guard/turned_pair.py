@@ -2,9 +2,9 @@
 and more.
 
 Its rows differ by more than features are searched, or by so much that terms of small angles do not
-hold; turned about y, far points have disparities that are negative. It is suspected where few corners
-of the first pair match along their rows, or many with a negative disparity, or where features of
-the first two pairs that moved have another yaw. Then SIFT key points of the next pairs tell the
+hold; turned about y, far points have disparities that are negative. It is suspected where few
+corners of the first pair match along their rows, or many with a negative disparity, or where
+features of the first two pairs that moved have another yaw. Then SIFT key points of the next pairs tell the
 rotation, if they have one (`vio.guard.turned_points`).
 
 From then on right images are turned back. Frames before are left out, as their depths would stay in
@@ -28,7 +28,7 @@ from vio.calibration.pair_rotation import (
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.guard.image_change import image_change
+from vio.guard.image_change import has_moved
 from vio.guard.image_check import FrameImages, ImageCheck
 from vio.guard.match_check import SharedMatches, shared_matches
 from vio.guard.probe import RowProbe
@@ -48,10 +48,7 @@ class _TurnedRules(NamedTuple):
     max_yaw_sigma_deg: float = 0.2  # of a yaw by the motion of features
     min_flow_px: float = 2.0  # of features in the mean, between frames that tell it …
     max_still: int = 40  # … and frames with less of it after which none is waited for
-    # mean change since the last pair, gray levels at the common contrast, of one that has moved …
-    min_change: float = 2.0
-    stride_px: int = 4
-    max_wait: int = 20  # … and frames after which those that have not are taken
+    max_wait: int = 20  # frames that have not moved since the last pair, before one is taken
 
 
 _TURNED = _TurnedRules()
@@ -87,7 +84,7 @@ class TurnedPair(ImageCheck):
         self._seen: Observations | None = None  # features of the frame before
         self._used_frames = False  # before the camera was suspected
         self._points: TurnedPoints | None = None  # of the pairs so far
-        self._last: Image | None = None  # the left image of the last of them, at few pixels
+        self._last: Image | None = None  # the left image of the last of them, at half resolution
         self.rotation: FloatArray | None = None  # (3,) rad, that is taken back; None: none is
 
     def inspect(self, images: FrameImages) -> FrameImages:
@@ -138,8 +135,8 @@ class TurnedPair(ImageCheck):
             self._look_at(then)
 
     def _ask_corners(self, images: FrameImages) -> None:
-        """Suspect the camera where few corners of a pair match on their rows, or many with a negative
-        disparity.
+        """Suspect the camera where few corners of a pair match on their rows, or many with a
+        negative disparity.
         """
         left, right = images.halves
         corners = self._probe.corners(left)
@@ -164,15 +161,15 @@ class TurnedPair(ImageCheck):
         """Add a pair that has moved since the last one, and decide once there are enough."""
         from vio.guard.turned_points import TurnedPoints  # they load descriptors
 
-        now = images.halves[0][:: _TURNED.stride_px, :: _TURNED.stride_px].copy()
+        left = images.halves[0]
         if (
             self._last is not None
             and self._waited < _TURNED.max_wait
-            and image_change(now, self._last) < _TURNED.min_change
+            and not has_moved(left, self._last)
         ):
             self._waited += 1
             return
-        self._last = now
+        self._last = left.copy()
         if self._points is None:
             self._points = TurnedPoints(self._camera, rows_may_agree=self._used_frames)
         if not self._points.add(images.raw):

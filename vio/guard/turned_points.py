@@ -1,8 +1,8 @@
 """The rotation of a right camera by SIFT key points of some pairs, whatever the rows.
 
-A rotation after which the rows of nearly all agree is that of the camera, if all pairs have the same
-one. Pairs of images of two times have another one in each pair, or more points agree with the image
-of their time. The yaw, which rows tell badly, comes from motion between the pairs
+A rotation after which the rows of nearly all agree is that of the camera, if all pairs have the
+same one. Pairs of images of two times have another one in each pair, or more points agree with the
+image of their time. The yaw, which rows tell badly, comes from motion between the pairs
 (`vio.calibration.pair_rotation`).
 """
 
@@ -53,6 +53,7 @@ class _Pair:
 
     left: Keypoints
     right: Keypoints
+    z: FloatArray  # (N, 4) pixels [ul vl ur vr] of the left ones; right ones NaN where none matches
 
 
 class TurnedPoints:
@@ -74,8 +75,9 @@ class TurnedPoints:
         """Add the images (H, W) of a pair; return whether the pairs can be those of a turned
         camera.
         """
-        pair = _Pair(*OpenCvExtractor("sift", _POINTS.keypoints)(*images))
-        found = self._by_rows(pair.left, pair.right)
+        left, right = OpenCvExtractor("sift", _POINTS.keypoints)(*images)
+        pair = _Pair(left, right, _in_both(left, right))
+        found = self._by_rows(pair.z)
         if found is None or not (
             self._rows_may_agree or is_turned_by_rows(np.degrees(found.rotation))
         ):
@@ -85,13 +87,12 @@ class TurnedPoints:
         return _is_constant(self._rows) and not self._fits_another_time()
 
     def rotation(self) -> PairRotation | None:
-        """Return the rotation of the pairs; None: it is not more than that of a usual calibration."""
+        """Return the rotation of the pairs; None: it is no more than that of usual calibrations."""
         found = self._rotation()
         return found if np.abs(found.rotation).max() >= np.radians(MIN_TURN_DEG) else None
 
-    def _by_rows(self, left: Keypoints, right: Keypoints) -> PairRotation | None:
-        rows, others = _matched(left, right)
-        found = rotation_by_rows(self._camera, np.hstack([left.pixels[rows], right.pixels[others]]))
+    def _by_rows(self, z: FloatArray) -> PairRotation | None:
+        found = rotation_by_rows(self._camera, z[np.isfinite(z[:, 2])])
         return found if found is not None and found.share >= _POINTS.min_share else None
 
     def _rotation(self) -> PairRotation:
@@ -115,7 +116,7 @@ class TurnedPoints:
         return PairRotation(mean, len(moved) * covariance, points, share)
 
     def _rotation_by_rows(self) -> PairRotation:
-        """Return the rotation by the rows of all pairs; no yaw where a lens may be what they show."""
+        """Return the rotation by the rows of all pairs; no yaw where they may show a lens."""
         mean = np.mean([found.rotation for found in self._rows], axis=0)
         if abs(mean[1]) < np.radians(MIN_ROW_YAW_DEG):
             mean[1] = 0.0
@@ -124,25 +125,20 @@ class TurnedPoints:
     def _by_motion(self, before: _Pair, now: _Pair, start: FloatArray) -> PairRotation | None:
         """Return the rotation by the points that two pairs show."""
         rows, others = _matched(before.left, now.left)
-        first = _right_pixels(before)[rows]
-        second = _right_pixels(now)[others]
-        both = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
-        return rotation_by_motion(
-            self._camera,
-            np.hstack([before.left.pixels[rows], first])[both],
-            np.hstack([now.left.pixels[others], second])[both],
-            start,
-        )
+        first = before.z[rows]
+        second = now.z[others]
+        both = np.isfinite(first[:, 2]) & np.isfinite(second[:, 2])
+        return rotation_by_motion(self._camera, first[both], second[both], start)
 
     def _fits_another_time(self) -> bool:
-        """Whether clearly more points of the newest pair agree with the other image of a pair before,
-        along the rows as calibrated.
+        """Whether clearly more points of the newest pair agree with the other image of a pair
+        before, along the rows as calibrated.
         """
         now = self._pairs[-1]
         least = _POINTS.clear_factor * self._rows[-1].points
         for before in self._pairs[-1 - _POINTS.max_delay : -1]:
             for left, right in ((before.left, now.right), (now.left, before.right)):
-                found = self._by_rows(left, right)
+                found = self._by_rows(_in_both(left, right))
                 if (
                     found is not None
                     and found.points > least
@@ -152,14 +148,15 @@ class TurnedPoints:
         return False
 
 
-def _right_pixels(pair: _Pair) -> FloatArray:
-    """Return where the right image shows the key points (N, 2) of the left one; not a number where
-    none matches.
+def _in_both(left: Keypoints, right: Keypoints) -> FloatArray:
+    """Return pixels `[ul vl ur vr]` (N, 4) of the key points of a left image; right ones are not a
+    number where none matches.
     """
-    rows, others = _matched(pair.left, pair.right)
-    out = np.full((len(pair.left), 2), np.nan)
-    out[rows] = pair.right.pixels[others]
-    return out
+    rows, others = _matched(left, right)
+    z = np.full((len(left), 4), np.nan)
+    z[:, :2] = left.pixels
+    z[rows, 2:] = right.pixels[others]
+    return z
 
 
 def _is_constant(found: list[PairRotation]) -> bool:

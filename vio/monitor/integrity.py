@@ -80,9 +80,8 @@ class IntegrityMonitor:
         # innovations over their standard deviations by a motion sensor
         self._ratios = deque[float](maxlen=_INNOVATION.frames)
         self._misled_m = 0.0  # what the position may be off by more than stated, as they say
-        self._largest = (
-            0.0  # variance of the position in any direction, as stated at the last frame
-        )
+        # largest variance of the position in any direction, as stated at the last frame
+        self._largest = 0.0
         # frames and the level of the scale's doubt that their covariances have from there on: less
         # in each than in the one before
         self._scale_doubts: list[tuple[int, int]] = []
