@@ -68,7 +68,8 @@ mutations: $(TESTED)
 # a frame costs beside the last commit; a change of it belongs into tools/speed.json (--write).
 bench: $(VENV)/.base
 	$(BIN)/vio bench small --out bench/small --cache bench/cache
-	test -d bench/speed || $(BIN)/vio render --out bench/speed --rig small --width 320 --rate 20 --duration 1.5 --format euroc
+	rm -rf bench/speed
+	$(BIN)/vio render --out bench/speed --rig small --width 320 --rate 20 --duration 1.5 --format euroc
 	$(BIN)/python -m tools.speed bench/speed
 
 # Run the suites behind docs/results.md and the README and write their tables (VIO_DATA=recordings; an hour and a half on two

@@ -37,6 +37,7 @@ class _Fit(NamedTuple):
     max_p2: float = 6e-3
     step: float = 1e-6  # of numeric derivatives by angles, distortion, motion and points
     iterations: int = 12
+    converged: float = 1e-4  # squared standard deviations that a step is long
     min_disparity_px: float = 0.5  # of points from which the motion starts
     rounding: float = 1e-9  # share of normal equations below which they are none
 
@@ -98,14 +99,14 @@ def rotation_by_rows(camera: StereoCamera, z: FloatArray) -> PairRotation | None
     rays = left_rays(camera, z[:, 2:])  # both cameras have the same intrinsics
 
     def off(w: FloatArray) -> FloatArray:
-        return camera.fv * (_undone(rays, w, 0.0)[:, 1] - rows)
+        return camera.fv * (_undone(rays, so3_exp(w))[..., 1] - rows)
 
     prior: FloatArray = np.eye(3) / _FIT.prior_rad**2
     w: FloatArray = np.zeros(3)
     normal = prior
     for width in _FIT.widths_px:
         r = off(w)
-        J = np.stack([(off(w + step) - r) / _FIT.step for step in _FIT.step * np.eye(3)], axis=1)
+        J = (off(w + _FIT.step * np.eye(3)) - r).T / _FIT.step
         weights = 1.0 / (1.0 + (r / width) ** 2)
         sigma = max(_FIT.sigma_px, robust_sigma(r[np.abs(r) < 2 * width]))
         normal = (J.T * weights) @ J / sigma**2 + prior
@@ -157,6 +158,8 @@ def _adjusted(seen: _SeenTwice, shared: FloatArray, count: int) -> PairRotation 
         step = np.linalg.solve(reduced, -gradient - information * shared)
         shared = shared + step
         points = np.add(points, change(np.asarray(step, dtype=np.float64)))
+        if step @ reduced @ step < _FIT.converged:
+            break
     r = seen.residuals(shared, points)
     agree = np.abs(r).max(axis=1) < 4.0 * max(_FIT.sigma_px, robust_sigma(r))
     if agree.sum() < _FIT.min_points or not abs(shared[3]) < _FIT.max_p2:
@@ -165,17 +168,17 @@ def _adjusted(seen: _SeenTwice, shared: FloatArray, count: int) -> PairRotation 
     return PairRotation(shared[:3], covariance, int(agree.sum()), float(agree.sum() / count))
 
 
-def _undone(rays: FloatArray, rotation: FloatArray, p2: float) -> FloatArray:
-    """Return where a right camera as calibrated shows rays (N, 3) of one that is turned and has
-    tangential distortion p2: (N, 2), focal lengths.
+def _undone(rays: FloatArray, R: FloatArray, p2: FloatArray | None = None) -> FloatArray:
+    """Return where a right camera as calibrated shows rays (N, 3) of one that is turned by R
+    (..., 3, 3) and has tangential distortion p2 (...): (..., N, 2), focal lengths.
     """
-    x = rays[:, 0]
-    y = rays[:, 1]
-    bent = rays.copy()
-    bent[:, 0] -= p2 * (3 * x * x + y * y)
-    bent[:, 1] -= p2 * 2 * x * y
-    turned = bent @ so3_exp(rotation)
-    return np.asarray(turned[:, :2] / turned[:, 2:], dtype=np.float64)
+    if p2 is not None:
+        x = rays[:, 0]
+        y = rays[:, 1]
+        bend = np.stack([3 * x * x + y * y, 2 * x * y, np.zeros(len(rays))], axis=1)
+        rays = rays - p2[..., None, None] * bend
+    turned = rays @ R
+    return np.asarray(turned[..., :2] / turned[..., 2:], dtype=np.float64)
 
 
 class _SeenTwice:
@@ -199,7 +202,7 @@ class _SeenTwice:
     def points(self, rotation: FloatArray) -> FloatArray:
         """Return the points (N, 3) by the first pair."""
         left = self._left[0]
-        right = _undone(self._rays[0], rotation, 0.0)
+        right = _undone(self._rays[0], so3_exp(rotation))
         row = 0.5 * (left[:, 1] + right[:, 1])
         return np.stack([left[:, 0], row, left[:, 0] - right[:, 0]], axis=1)
 
@@ -214,21 +217,23 @@ class _SeenTwice:
         return self._left[1]
 
     def residuals(self, shared: FloatArray, points: FloatArray) -> FloatArray:
-        """Return residuals (N, 8), pixels, of unknowns (10,) and points (N, 3)."""
-        rotation = shared[:3]
-        p2 = float(shared[3])
-        u, v, d = points.T
-        ones = np.ones_like(u)
-        moved = np.stack([u, v, ones], axis=1) @ so3_exp(shared[4:7]).T + d[:, None] * shared[7:10]
-        depth = moved[:, 2:]
-        off = [
-            self._left[0] - points[:, :2],
-            _undone(self._rays[0], rotation, p2) - np.stack([u - d, v], axis=1),
-            self._left[1] - moved[:, :2] / depth,
-            _undone(self._rays[1], rotation, p2)
-            - (moved[:, :2] - np.stack([d, 0 * d], axis=1)) / depth,
-        ]
-        return self._camera.fu * np.concatenate(off, axis=1)
+        """Return residuals (..., N, 8), pixels, of unknowns (..., 10) and points (..., N, 3)."""
+        R = so3_exp(shared[..., :3])
+        p2 = shared[..., 3]
+        place = points[..., :2]
+        d = points[..., 2:]
+        right_of = np.concatenate([d, np.zeros_like(d)], axis=-1)
+        rays = np.concatenate([place, np.ones_like(d)], axis=-1)
+        motion = so3_exp(shared[..., 4:7])
+        moved = rays @ motion.swapaxes(-1, -2) + d * shared[..., None, 7:]
+        depth = moved[..., 2:]
+        off = np.broadcast_arrays(
+            self._left[0] - place,
+            _undone(self._rays[0], R, p2) - (place - right_of),
+            self._left[1] - moved[..., :2] / depth,
+            _undone(self._rays[1], R, p2) - (moved[..., :2] - right_of) / depth,
+        )
+        return self._camera.fu * np.concatenate(off, axis=-1)
 
     def equations(
         self, shared: FloatArray, points: FloatArray
@@ -239,10 +244,10 @@ class _SeenTwice:
         r = self.residuals(shared, points)
         sigma = max(_FIT.sigma_px, robust_sigma(r))
         h = _FIT.step
-        A = np.stack(
-            [(self.residuals(shared + h * e, points) - r) / h for e in np.eye(_SHARED)], axis=2
-        )
-        B = np.stack([(self.residuals(shared, points + h * e) - r) / h for e in np.eye(3)], axis=2)
+        by_shared = self.residuals(shared + h * np.eye(_SHARED), points)
+        A = np.moveaxis(by_shared - r, 0, -1) / h
+        by_point = self.residuals(shared, points + h * np.eye(3)[:, None])
+        B = np.moveaxis(by_point - r, 0, -1) / h
         squared = (r * r).sum(axis=1) / (_PIXELS * sigma**2)
         weights = 1.0 / (1.0 + squared) / sigma**2
         Aw = A * weights[:, None, None]
