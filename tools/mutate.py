@@ -10,7 +10,8 @@ and a test is missing. At the end the tests that detected something run on an un
 all must pass. Recordings are taken from VIO_DATA.
 
 With --constants, N constants are drawn from a seed in place of the list, from each part by its
-share: numbers at the top of a module, each times and over 1.5 (whole numbers by one at least). The
+share: numbers at the top of a module, each times and over 1.5 (whole numbers by one at least), but
+those that are declared as a Tolerance or a Capacity (`vio/numerics/kinds.py`) and decide nothing. The
 tests of such a mutation are those of the list for its file, the test files that name its module,
 those of whole results, and those in the folder of its package that name a module which imports it,
 ten at most.
@@ -43,7 +44,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tools.measures import number_constants
+from tools.measures import kind_of, number_constants
 from tools.parts import PARTS, part_of, read_edges, source_files
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -250,7 +251,7 @@ def _scaled(text: str) -> Iterator[tuple[str, str, str, str]]:
         if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
             continue
         target = node.targets[0] if isinstance(node, ast.Assign) else node.target
-        if not isinstance(target, ast.Name) or target.id not in numbers:
+        if not isinstance(target, ast.Name) or target.id not in numbers or kind_of(node):
             continue
         old = ast.get_source_segment(text, node)
         value = ast.get_source_segment(text, node.value)

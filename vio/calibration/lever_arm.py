@@ -14,6 +14,7 @@ from vio.calibration.inertial import ImuAlignment, Rates
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import jackknife, robust_sigma
 from vio.records import S_PER_NS, FeatureTracks, IntArray
 
@@ -27,9 +28,9 @@ class _FitRules:
     window_s: float = 1.0
     min_windows: int = 12
     huber: float = 2.0  # standard deviations
-    reweightings: int = 4
+    reweightings: Tolerance[int] = 4
     # keeps the fit solvable where a recording never accelerates or never rotates
-    ridge: float = 1e-9
+    ridge: Tolerance[float] = 1e-9
 
 
 _FIT = _FitRules()

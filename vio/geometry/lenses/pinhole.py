@@ -14,8 +14,9 @@ from vio.geometry.lenses.model import (
     plane_by_point,
 )
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 
-_MIN_DEPTH = 1e-9
+_MIN_DEPTH: Tolerance[float] = 1e-9
 
 
 def pinhole(p: FloatArray) -> tuple[FloatArray, BoolArray]:

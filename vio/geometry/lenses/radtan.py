@@ -22,12 +22,13 @@ from vio.geometry.lenses.model import (
 from vio.geometry.lenses.pinhole import pinhole, pinhole_by_point
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Tolerance
 
-_NEWTON_STEPS = 30
-_NEWTON_TOLERANCE = 1e-11  # on the normalised image plane: about 1e-8 px
+_NEWTON_STEPS: Tolerance[int] = 30
+_NEWTON_TOLERANCE: Tolerance[float] = 1e-11  # on the normalised image plane: about 1e-8 px
 _MAX_NEWTON_STEP = 0.5  # on the normalised image plane
-_MIN_DETERMINANT = 1e-6
-_SAME_POINT = 1e-8  # on the normalised image plane
+_MIN_DETERMINANT: Tolerance[float] = 1e-6
+_SAME_POINT: Tolerance[float] = 1e-8  # on the normalised image plane
 
 
 def _five(c: Coefficients) -> tuple[float, float, float, float, float]:
