@@ -14,7 +14,7 @@ from vio.frontend.patches import ImageLevels, inside, mean_and_contrast
 from vio.frontend.tracks import ANCHOR_REACH_PX
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
-from vio.numerics.kinds import Tolerance
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.records import BoolArray, Image
 
 
@@ -28,7 +28,7 @@ class _Flow:
     # share of lost points above which tracking is repeated with all pyramid levels
     retry_share: float = 0.25
     lost_share: float = 0.5  # the same for the last attempt, which starts from the old pixels
-    stride: int = 4  # brightness is computed from every fourth pixel of the half image
+    stride: Capacity[int] = 4  # brightness is computed from every fourth pixel of the half image
     min_contrast: float = 1.0  # gray levels, lower bound of the contrast in the gain
     max_contrast_change: float = 0.06  # relative change of contrast, and
     # change of the mean gray level, up to which images are not adjusted

@@ -233,6 +233,16 @@ def _displaced(
     return _codes(check.take_findings())
 
 
+def _displaced_after_noisy_frames(frames: int) -> bool:
+    """Whether rows that are off by a pixel contradict those of exact frames and some noisy ones."""
+    check = DisplacedMatches(CAMERA)
+    for k in range(30):
+        check.inspect(_rows(k, 400, 0.0, 0.02), NOTHING)
+    for k in range(30, 34 + frames):
+        check.inspect(_rows(k, 400, 1.05 * (k >= 30 + frames), 0.445), NOTHING)
+    return bool(check.take_findings())
+
+
 def _exchanged(matches: int) -> list[str]:
     check = ExchangedMatches()
     for k in range(4):
@@ -275,6 +285,7 @@ def _never(shares: list[float], count: int = 100) -> list[str]:
 MATCHES: dict[str, tuple[Says, float, float]] = {
     "displaced: rows": (lambda x: _displaced(x) != [], 0.65, 0.85),
     "displaced: usual rows": (lambda x: _displaced(x, noise_px=0.445) != [], 1.25, 1.8),
+    "displaced: noise is learned": (lambda n: not _displaced_after_noisy_frames(int(n)), 4, 6),
     "displaced: frames": (lambda n: _displaced(3.0, before=int(n)) != [], 4, 5),
     "displaced: matches": (lambda n: _displaced(3.0, count=int(n)) != [], 19, 20),
     "displaced: back": (lambda x: len(_displaced(3.0, then_px=x)) == 1, 0.32, 0.44),
