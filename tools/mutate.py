@@ -147,19 +147,21 @@ class _TestsOf:
         }
 
     def __call__(self, module: str, file: str) -> tuple[str, ...]:
-        """Those of the list for its file, those of its name, those that name it, those of whole
-        results that it is part of, and those in the folder of its package that name a module which
-        imports it (where there are none, all that do), in this order. Tests of the whole project
-        name modules for other reasons.
+        """Tables of limits that name it, those of the list for its file, those of its name, those
+        that name it, those of whole results that it is part of, and those in the folder of its
+        package that name a module which imports it (where there are none, all that do), in this
+        order. Tests of the whole project name modules for other reasons.
         """
         name = module.rpartition(".")[2]
-        own = sorted(self._naming(module), key=lambda test: name not in test)
+        naming = self._naming(module)
+        quick = [test for test in naming if test.endswith("limits.py")]
+        own = sorted(naming, key=lambda test: name not in test)
         whole = [test for test, modules in self._whole.items() if module in modules]
         whole.sort(key=lambda test: not test.startswith(_folder(module)))
         of_users = [test for user in self._users.get(module, []) for test in self._naming(user)]
         inside = [test for test in of_users if test.startswith(_folder(module))]
         more = inside or ([] if own else of_users)
-        tests = [*self._listed.get(file, ()), *own[:2], *whole, *own[2:], *more]
+        tests = [*quick, *self._listed.get(file, ()), *own[:2], *whole, *own[2:], *more]
         of_mechanism = [test for test in tests if not test.startswith("tests/project/")]
         return tuple(dict.fromkeys(of_mechanism or tests))[:_MAX_FILES]
 

@@ -10,10 +10,12 @@ import pytest
 from tests.frontend.test_frontend_scene import CAMERA
 from vio.findings import Finding
 from vio.frontend.expected_motion import AGREEMENT_LIMIT, ExpectedMotion
-from vio.frontend.moving_object import TwoMotions
+from vio.frontend.moving_object import TwoMotions, _elected, _if_large
 from vio.frontend.object_report import ObjectReport
 from vio.frontend.outliers import Consensus
+from vio.frontend.reappearance import contradicts_gyro, is_long_gap
 from vio.frontend.right_camera import RightCamera
+from vio.frontend.right_delay import PairingCounts, RightDelay
 from vio.frontend.right_turn import PairShake, RightTurn
 from vio.geometry.lie import se3_exp
 from vio.records import MotionPrior
@@ -164,5 +166,71 @@ EXPECTED: dict[str, tuple[Says, float, float]] = {
 
 @pytest.mark.parametrize(("says", "below", "above"), EXPECTED.values(), ids=EXPECTED)
 def test_limits_of_expected_motions(says: Says, below: float, above: float) -> None:
+    assert not says(below)
+    assert says(above)
+
+
+# A right camera that is late, tracks after gaps, votes
+
+
+def _suspected(points: int, late: int, same: int, early: int, frames: int = 2) -> bool:
+    delay = RightDelay(CAMERA)
+    counts = PairingCounts(points, same, late, early)
+    return [delay.suspect(k, counts, 0.1) for k in range(frames)][-1]
+
+
+def _found_delay(
+    frames_late: float,
+    frames: int = 40,
+    matches: int = 200,
+    noise_px: float = 0.05,
+    then: float | None = None,
+) -> float:
+    """The delay that is taken out, of rows that move by it; `then`: the delay of two hundred
+    frames more.
+    """
+    rng = np.random.default_rng(0)
+    delay = RightDelay(CAMERA)
+    late = [frames_late] * frames + ([] if then is None else [then] * 200)
+    for k, each in enumerate(late):
+        left = rng.uniform([10.0, 10.0], [300.0, 200.0], (matches, 2))
+        flow = rng.normal([0.0, 6.0 * np.sin(0.7 * k)], 1.0, (matches, 2))
+        rows = -each * flow[:, 1] + rng.normal(0.0, noise_px, matches)
+        delay.update(k, left, flow, rows, 0.1)
+    return delay.frames
+
+
+def _contradicts(deg: float) -> bool:
+    motion = MotionPrior(se3_exp(np.zeros(6)), 1e-10 * np.eye(6))
+    return contradicts_gyro(se3_exp([0, 0, 0, 0, np.radians(deg), 0]), motion)
+
+
+def _elects(first: int, second: int) -> bool:
+    follows = np.arange(first + second) < first
+    return _elected(follows, ~follows) is not None
+
+
+OTHERS: dict[str, tuple[Says, float, float]] = {
+    "late: share": (lambda n: _suspected(100, int(n), 10, 10), 38, 42),
+    "late: clearly": (lambda n: _suspected(100, int(n), 40, 10), 58, 62),
+    "late: points": (lambda n: _suspected(int(n), int(n), 0, 0), 29, 30),
+    "late: frames": (lambda n: _suspected(100, 90, 10, 10, int(n)), 1, 2),
+    "late: by rows": (lambda x: _found_delay(x) != 0.0, 0.22, 0.28),
+    "late: frames by rows": (lambda n: _found_delay(0.5, int(n)) != 0.0, 9, 10),
+    "late: matches by rows": (lambda n: _found_delay(0.5, matches=int(n)) != 0.0, 29, 30),
+    "late: whole frames": (lambda x: _found_delay(1.0 - x) != 1.0, 0.13, 0.17),
+    "late: explained": (lambda x: _found_delay(0.5, 300, 900, x) == 0.0, 10.0, 13.0),
+    "late: forgotten": (lambda x: _found_delay(0.5, then=x) != 0.0, 0.085, 0.115),
+    "gap: seconds": (lambda x: is_long_gap(round(1e9 * x), 10_000_000), 0.72, 0.88),
+    "gap: steps": (lambda x: is_long_gap(round(4e8 * x), 400_000_000), 4.5, 5.5),
+    "gap: contradicts the gyro": (_contradicts, 1.2, 1.45),
+    "votes: points": (lambda n: _elects(int(n), 0), 11, 12),
+    "votes: share": (lambda n: _elects(int(n), 100 - int(n)), 66, 74),
+    "votes: object": (lambda x: _if_large(x) > 0.0, 0.22, 0.28),
+}
+
+
+@pytest.mark.parametrize(("says", "below", "above"), OTHERS.values(), ids=OTHERS)
+def test_limits_of_delays_gaps_and_votes(says: Says, below: float, above: float) -> None:
     assert not says(below)
     assert says(above)
