@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
@@ -10,10 +11,15 @@ import pytest
 from vio.datasets.gnss_fixes import GnssFixes, checked_fixes
 from vio.earth.alignment import Georeference, Path, georeference
 from vio.earth.geodesy import LocalFrame
-from vio.errors import EstimationError
+from vio.errors import DataError, EstimationError
 from vio.evaluation.alignment import align_poses, settle_rotation
 from vio.evaluation.reference_axes import attitude_note
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
+from vio.geometry.stereo import StereoCamera
+from vio.offline.comparison import _longest_piece, _scale_ratio, _stands_out, compare_keyframes
+from vio.offline.keyframes import TrackedPath, choose_keyframes, keyframes_by_overlap
+from vio.records import FeatureTracks, ImuRecord, Trajectory, observations
+from vio.targets.noise import allan_curve, measure_noise
 
 Says = Callable[[float], bool]
 
@@ -151,5 +157,143 @@ EARTH: dict[str, tuple[Says, float, float]] = {
 
 @pytest.mark.parametrize(("says", "below", "above"), EARTH.values(), ids=EARTH)
 def test_limits_of_geodesy(says: Says, below: float, above: float) -> None:
+    assert not says(below)
+    assert says(above)
+
+
+# Keyframes, and their comparison with another reconstruction
+
+CAMERA = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
+
+
+def _run(
+    step_m: float, count: int, seen: int = 40, kept: float = 0.9, turn_deg: float = 0.0
+) -> TrackedPath:
+    """A straight path past points 4 m away, of which a share is seen again in the next frame."""
+    parts = []
+    first = 0
+    for k in range(count):
+        first += round((1.0 - kept) * seen)
+        z = np.tile([320.0, 240.0, 310.0, 240.0], (seen, 1))
+        parts.append(observations(k, k, first + np.arange(seen), z))
+    offsets = seen * np.arange(count + 1)
+    tracks = FeatureTracks(
+        offsets,
+        np.concatenate([o.ids for o in parts]),
+        np.concatenate([o.z for o in parts]),
+        np.concatenate([o.has_right for o in parts]),
+        np.concatenate([o.stale for o in parts]),
+    )
+    phi = np.zeros((count, 3))
+    phi[:, 1] = np.radians(turn_deg) * np.arange(count)
+    p = np.column_stack([step_m * np.arange(count), np.zeros((count, 2))])
+    trajectory = Trajectory(
+        se3_from_parts(so3_exp(phi), p), None, "cam0", frame_indices=np.arange(count)
+    )
+    return TrackedPath(FilePath("run"), CAMERA, trajectory, tracks)
+
+
+def _steps(step_m: float, turn_deg: float = 0.0) -> int:
+    """Frames from keyframe to keyframe of a long run."""
+    return int(np.median(np.diff(choose_keyframes(_run(step_m, 400, turn_deg=turn_deg)))))
+
+
+def _other(
+    run: TrackedPath, scale: float = 1.0, noise_m: float = 0.0, end_m: float = 0.0
+) -> FloatArray:
+    T = run.trajectory.T_world_body.copy()
+    count = len(T)
+    T[:, :3, 3] *= scale
+    T[:, 1, 3] += end_m * (np.arange(count) / (count - 1)) ** 2
+    T[:, :3, 3] += noise_m * np.random.default_rng(0).normal(size=(count, 3))
+    return T
+
+
+def _has_scale(noise_m: float) -> bool:
+    run = _run(0.1, 100)
+    return _scale_ratio(_other(run, 1.0, noise_m), run.trajectory.T_world_body, 0.1)[0] is not None
+
+
+def _outlier(sigmas: float) -> bool:
+    values = np.random.default_rng(0).normal(1.0, 0.2, 200)
+    values[7] = 1.0 + 0.2 * sigmas
+    return bool(_stands_out(values, np.ones(200, dtype=np.bool_))[7])
+
+
+def _pieces(jump: float) -> bool:
+    """Whether a jump of so many steps makes two pieces."""
+    own = _run(0.1, 40).trajectory.T_world_body
+    other = own.copy()
+    other[:, :3, 3] += 1e-3 * np.random.default_rng(0).normal(size=(40, 3))
+    other[20:, 1, 3] += 0.1 * jump
+    return not _longest_piece(own, other, np.ones(39, dtype=np.bool_))[0].all()
+
+
+def _agree_at_end(end_m: float) -> bool:
+    run = _run(0.5, 60)
+    return not compare_keyframes(run, np.arange(60), _other(run, end_m=end_m)).segments
+
+
+KEYFRAMES: dict[str, tuple[Says, float, float]] = {
+    "all": (lambda n: len(choose_keyframes(_run(0.01, int(n)))) < n, 280, 320),
+    "step": (lambda x: _steps(x) < 10, 0.03, 0.037),
+    "turn": (lambda x: _steps(1e-6, x) < 10, 0.6, 0.72),
+    "overlap": (
+        lambda n: len(keyframes_by_overlap(_run(0.1, 41, kept=0.95), most=40)) < n,
+        10,
+        13,
+    ),
+    "scale is known": (lambda x: not _has_scale(x), 0.3, 0.42),
+    "stands out": (_outlier, 5.0, 7.2),
+    "jump": (_pieces, 0.85, 1.15),
+    "ends apart": (lambda x: not _agree_at_end(x), 0.25, 0.35),
+}
+
+
+@pytest.mark.parametrize(("says", "below", "above"), KEYFRAMES.values(), ids=KEYFRAMES)
+def test_limits_of_keyframes(says: Says, below: float, above: float) -> None:
+    assert not says(below)
+    assert says(above)
+
+
+# Noise of an IMU at rest
+
+
+def _rest(seconds: float, gap_periods: float = 1.0, shift: float = 0.0) -> bool:
+    """Whether a record at 10 Hz is taken for one at rest: with a gap, and a shift by so many
+    standard deviations of a mean over a second.
+    """
+    rng = np.random.default_rng(0)
+    count = round(10 * seconds) + 1
+    times = 0.1 * np.arange(count)
+    times[count // 2 :] += 0.1 * (gap_periods - 1.0)
+    values = rng.normal(size=(count, 6))
+    values[count // 2 :, 0] += shift / np.sqrt(10.0)
+    try:
+        measure_noise(ImuRecord((1e9 * times).astype(np.int64), values[:, :3], values[:, 3:]))
+    except DataError:
+        return False
+    return True
+
+
+def _averaging_times() -> int:
+    return len(allan_curve(np.random.default_rng(0).normal(size=90_000), 10.0).tau_s)
+
+
+REST: dict[str, tuple[Says, float, float]] = {
+    "time": (_rest, 280.0, 320.0),
+    "gap": (lambda x: not _rest(400.0, x), 2.8, 3.2),
+    "shift": (lambda x: not _rest(400.0, 1.0, x), 7.5, 13.0),
+    "longest averages": (
+        lambda x: allan_curve(np.zeros(9000) + 1e-9, 10.0).tau_s[-1] < x,
+        90.0,
+        115.0,
+    ),
+    "averages of a decade": (lambda n: _averaging_times() < n, 30, 42),
+}
+
+
+@pytest.mark.parametrize(("says", "below", "above"), REST.values(), ids=REST)
+def test_limits_of_noise_at_rest(says: Says, below: float, above: float) -> None:
     assert not says(below)
     assert says(above)
