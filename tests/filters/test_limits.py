@@ -7,8 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from vio.errors import CalibrationError
 from vio.filters.imu_gaps import ImuHistory
+from vio.filters.inputs import checked_extrinsics
 from vio.filters.noise import MotionNoise, StepErrors
+from vio.filters.overdispersion import Overdispersion
 from vio.filters.scale_test import ScaleTest, is_clear
 from vio.records import ImuSample
 
@@ -139,9 +142,52 @@ GAPS: dict[str, tuple[Says, float, float]] = {
     "longest lag": (lambda x: _hidden_rad(1.4) / _hidden_rad(0.7) < x, 2.2, 2.42),
     "memory": (lambda n: _hidden_after_turns(int(n)) < 0.1, 340, 460),
 }
+
+
+# Errors that neighbours have in common, and what a filter is given
+
+
+def _overdispersed(
+    tracks: int, apart_rad: float = 10.0, between: int = 0, ratio: float = 1.0
+) -> float:
+    """The factor after tracks with scores of a size, of which two at a time end, some frames apart
+    in time and some radians apart in direction.
+    """
+    learned = Overdispersion()
+    for k in range(tracks // 2):
+        for n in range(2):
+            learned.add(
+                np.array([2 * k + n]),
+                np.array([[0.1 + 10.0 * k + n * apart_rad, 0.1]]),
+                np.full((1, 6), np.sqrt(ratio)),
+                np.ones((1, 6)),
+            )
+            for _ in range(between if n == 0 else 9 - between):
+                nothing = np.zeros((0, 6))
+                learned.add(np.zeros(0, np.int64), np.zeros((0, 2)), nothing, nothing)
+    return learned.factor
+
+
+def _takes_extrinsics(far_m: float) -> bool:
+    T = np.eye(4)
+    T[0, 3] = far_m
+    try:
+        checked_extrinsics(T)
+    except CalibrationError:
+        return False
+    return True
+
+
+INPUTS: dict[str, tuple[Says, float, float]] = {
+    "common errors: before any track": (lambda x: Overdispersion().factor < x, 2.2, 2.8),
+    "common errors: prior": (lambda x: _overdispersed(30) < x, 1.69, 1.81),
+    "common errors: neighbours": (lambda x: _overdispersed(400, x) < 1.5, 0.08, 0.12),
+    "common errors: frames": (lambda n: _overdispersed(400, 0.0, int(n)) < 1.5, 4, 6),
+    "far IMU": (lambda x: not _takes_extrinsics(x), 900.0, 1100.0),
+}
 TABLES = {
     f"{what}: {name}": row
-    for what, table in (("scale", SCALE), ("noise", NOISE), ("gaps", GAPS))
+    for what, table in (("scale", SCALE), ("noise", NOISE), ("gaps", GAPS), ("inputs", INPUTS))
     for name, row in table.items()
 }
 
