@@ -23,9 +23,10 @@ from vio.guard.image_check import FrameImages
 from vio.guard.lost_matches import LostMatches
 from vio.guard.match_check import SharedMatches
 from vio.guard.never_matched import NeverMatched
-from vio.guard.pairing import told_delay
+from vio.guard.pairing import PairingCheck, told_delay
 from vio.guard.probe import RowProbe
 from vio.guard.swap import SwapDetector
+from vio.guard.turned_pair import TurnedPair
 from vio.records import Image, Observations, StereoFrame, observations
 
 Says = Callable[[float], bool]
@@ -306,5 +307,88 @@ MATCHES: dict[str, tuple[Says, float, float]] = {
 
 @pytest.mark.parametrize(("says", "below", "above"), MATCHES.values(), ids=MATCHES)
 def test_limits_of_matches(says: Says, below: float, above: float) -> None:
+    assert not says(below)
+    assert says(above)
+
+
+# The first frames: pairs that are late, and a right camera that is turned
+
+
+class _Counts:
+    """A search along rows of images that hold their frame's number, with given counts."""
+
+    def __init__(self, of_delay: dict[int, int], corners: int = 100, negative: int = 0) -> None:
+        self._of_delay = of_delay
+        self._corners = corners
+        self._negative = negative
+
+    def corners(self, image: Image) -> np.ndarray:
+        return np.zeros((self._corners, 2))
+
+    def on_rows(self, left: Image, right: Image, points: np.ndarray) -> int:
+        """Of images in another order than left and right none match."""
+        is_pair = left[3, 12] == 0 and right[3, 12] == 1
+        return self._of_delay.get(int(left[3, 3]) - int(right[3, 3]), 0) if is_pair else 0
+
+    def negative(self, left: Image, right: Image, points: np.ndarray) -> int:
+        return self._negative
+
+    def near_rows(self, left: Image, right: Image, points: np.ndarray) -> np.ndarray:
+        return np.full(3, self.on_rows(left, right, points))
+
+
+def _images(index: int) -> FrameImages:
+    pair = []
+    for camera in range(2):
+        full = _grays(seed=2 * index + camera)
+        full[:16, :16] = index
+        full[:16, 16:32] = camera
+        pair.append(full)
+    return FrameImages(StereoFrame(index, index * STEP_NS, *pair), tuple(pair))
+
+
+def _decided(of_delay: dict[int, int], frames: int, corners: int = 100) -> int | None:
+    check = PairingCheck(_Counts(of_delay, corners))  # type: ignore[arg-type]
+    for k in range(frames):
+        check.inspect(_images(k))
+    return check.delay
+
+
+def _evidence(on_rows: int, negative: int = 0, corners: int = 100, frames: int = 1) -> str | None:
+    """What is looked at after a number of pairs with given counts."""
+    probe = _Counts({0: on_rows}, corners, negative)
+    check = TurnedPair(CAMERA, probe)  # type: ignore[arg-type]
+    check._add_pair = lambda images: None  # type: ignore[method-assign]
+    for k in range(frames):
+        check.inspect(_images(k))
+    return check._looks_at
+
+
+def _waits(flow_px: float, frames: int) -> bool:
+    """Whether a camera is still waited for whose features move by so much a frame."""
+    check = TurnedPair(CAMERA, _Counts({0: 100}))  # type: ignore[arg-type]
+    check.inspect(_images(0))
+    for k in range(frames):
+        seen = _rows(0, 100, 0.0, 0.0)
+        moved = replace(seen, frame_index=k, z=seen.z + k * flow_px * np.array([1.0, 0, 1.0, 0]))
+        check.see(moved)
+    return check._looks_at == "features"
+
+
+FIRST: dict[str, tuple[Says, float, float]] = {
+    "pairs: counted frames": (lambda n: _decided({0: 90}, int(n)) is not None, 3, 4),
+    "pairs: tests": (lambda n: _decided({0: 5}, int(n)) is not None, 40, 41),
+    "pairs: frames apart": (lambda n: _decided({-int(n): 90, 0: 5}, 12) != n, 3, 4),
+    "turned: few corners match": (lambda n: _evidence(int(n)) == "features", 47, 53),
+    "turned: negative disparities": (lambda n: _evidence(90, int(n)) == "pairs", 23, 28),
+    "turned: corners": (lambda n: _evidence(0, corners=int(n)) == "pairs", 29, 30),
+    "turned: tries": (lambda n: _evidence(0, corners=5, frames=int(n)) == "features", 2, 3),
+    "turned: flow": (lambda x: not _waits(x, 3), 1.7, 2.3),
+    "turned: still": (lambda n: not _waits(0.0, int(n)), 39, 40),
+}
+
+
+@pytest.mark.parametrize(("says", "below", "above"), FIRST.values(), ids=FIRST)
+def test_limits_of_the_first_frames(says: Says, below: float, above: float) -> None:
     assert not says(below)
     assert says(above)
