@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from vio.findings import Finding
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, so3_exp
+from vio.monitor.accelerometer import judge_up
 from vio.monitor.contradiction import ImuContradiction
+from vio.monitor.gyro_fit import GyroFit
 from vio.monitor.health import RefusalReport, RunHealth
 from vio.monitor.integrity import IntegrityMonitor
 from vio.monitor.samples import Samples, judge_size
@@ -275,5 +277,48 @@ READINGS: dict[str, tuple[Says, float, float]] = {
 
 @pytest.mark.parametrize(("says", "below", "above"), READINGS.values(), ids=READINGS)
 def test_limits_of_readings(says: Says, below: float, above: float) -> None:
+    assert not says(below)
+    assert says(above)
+
+
+# The gyro and gravity beside the camera
+
+
+def _gyro_fit(
+    rate: float = 1.0, noise: float = 1e-6, unexplained: float = 0.0, count: int = 10_000
+) -> GyroFit:
+    """A gyro that measures the camera's rates about one axis, or about all of them alike."""
+    S = rate**2 * np.eye(3)
+    none = np.zeros((0, 3))
+    return GyroFit(
+        0.0, S, S, S, np.eye(3), np.zeros(3), unexplained, noise, count, none, none,
+        np.zeros(0, np.bool_), np.zeros(0),
+    )  # fmt: skip
+
+
+def _turned(deg: float) -> FloatArray:
+    return so3_exp([0.0, np.radians(deg), 0.0])
+
+
+def _upside_down(deg: float, share: float = 1.0) -> bool:
+    """Whether a camera is said to be, by forces that show the sky so far from below it."""
+    angle = np.radians(deg)
+    down = np.array([np.sin(angle), np.cos(angle), 0.0])
+    forces = np.where(np.arange(100)[:, None] < round(100 * share), down, [0.0, -1.0, 0.0])
+    return bool(judge_up(9.81 * forces, np.eye(3), measured=True))
+
+
+BESIDE: dict[str, tuple[Says, float, float]] = {
+    "gyro: rate": (lambda x: _gyro_fit(x).axes > 0, 0.018, 0.022),
+    "gyro: clear of noise": (lambda x: _gyro_fit(x, 0.1).axes > 0, 0.45, 0.55),
+    "gyro: fits": (lambda x: not _gyro_fit().fits(_turned(x)), 12.0, 16.0),
+    "gyro: by chance": (lambda n: _gyro_fit(unexplained=0.5, count=int(n)).tolerance < 0.5, 55, 65),
+    "up: angle": (lambda x: not _upside_down(x), 56.0, 64.0),
+    "up: share": (lambda x: _upside_down(0.0, x), 0.93, 0.97),
+}
+
+
+@pytest.mark.parametrize(("says", "below", "above"), BESIDE.values(), ids=BESIDE)
+def test_limits_of_gyro_and_gravity(says: Says, below: float, above: float) -> None:
     assert not says(below)
     assert says(above)
