@@ -10,10 +10,12 @@ import pytest
 
 from vio.datasets.frame_times import pair_stamps
 from vio.errors import DataError
+from vio.geometry.lie import so3_exp
 from vio.live.figures import LiveMonitor
 from vio.live.pairing import Pairing
 from vio.live.prediction import PosePredictor
 from vio.live.processor import EventOrder, _wait_ns
+from vio.mavlink.messages import LocalFrame, StampClock
 from vio.records import Estimate, ImuSample, StereoFrame
 from vio.ros2.sensors import _Step
 
@@ -130,6 +132,30 @@ def _still_waiting(images: int) -> bool:
     return pairing.add(1, 0, "right") is not None
 
 
+def _heading_deg(level: float) -> float:
+    """Where the nose of a vehicle points at the start that is rolled, and whose nose points up but
+    for a level part: 0, unless its belly says what is ahead.
+    """
+    T = np.eye(4)
+    T[:3, :3] = so3_exp([0.0, -np.arccos(level), 0.0]) @ so3_exp([0.7, 0.0, 0.0])
+    frame = LocalFrame(np.diag([1.0, -1.0, -1.0]), is_upright=True)
+    R = frame.state(Estimate(0, T, np.eye(6)), 0).R_local_frd
+    return float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
+
+
+def _is_wall_clock(apart_s: float) -> bool:
+    return StampClock(10**18, 10**12, 10**18 - round(1e9 * apart_s)).is_wall
+
+
+def _quickest_is_known(arrivals: int) -> bool:
+    """Whether the quickest of all arrivals counts after so many slower ones."""
+    clock = StampClock(0, 10**15, 10**12)
+    clock.placed_ns(0, 10**15)
+    for k in range(1, arrivals):
+        clock.placed_ns(k, 10**15 + 10**9 + k)
+    return clock.placed_ns(arrivals, 10**15 + 10**9 + arrivals) < 10**15 + 10**8
+
+
 LIMITS: dict[str, tuple[Says, float, float]] = {
     "prediction: held": (lambda x: _carried_m(10.0) < x, 0.45, 0.55),
     "prediction: late": (_late_estimate_moves, 1.8, 2.3),
@@ -140,6 +166,9 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "pairs": (lambda x: not _pairs(x), 2.7, 3.3),
     "pairs of lists": (lambda x: not _pairs_of_lists(x), 2.7, 3.3),
     "pairs: waiting": (lambda n: not _still_waiting(int(n)), 10, 11),
+    "nose: points up": (lambda x: abs(_heading_deg(x)) < 1.0, 0.09, 0.11),
+    "clock: of this computer": (lambda x: not _is_wall_clock(x), 9.0, 11.0),
+    "clock: arrivals": (lambda n: not _quickest_is_known(int(n)), 190, 210),
     "clock: back": (lambda x: _Step(-round(MS * x), 0).is_back, 450.0, 550.0),
     "clock: ahead": (lambda x: not _Step(20_000 * MS, round(MS * x)).is_ahead, 1800.0, 2200.0),
 }
