@@ -148,6 +148,8 @@ def kind_of(node: ast.stmt) -> str | None:
     if not (isinstance(node, ast.AnnAssign) and isinstance(node.annotation, ast.Subscript)):
         return None
     kind = node.annotation.value
+    if isinstance(node.annotation.slice, ast.Subscript):  # ClassVar[Capacity[int]]
+        kind = node.annotation.slice.value
     return kind.id if isinstance(kind, ast.Name) and kind.id in KINDS else None
 
 

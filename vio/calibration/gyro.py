@@ -14,7 +14,7 @@ from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import jackknife, robust_sigma
 from vio.records import S_PER_NS, BoolArray
 
-_BLOCKS = 10  # of the jackknife
+_BLOCKS: Tolerance[int] = 10  # of the jackknife
 
 
 @dataclass(frozen=True, slots=True)

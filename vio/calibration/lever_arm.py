@@ -23,7 +23,7 @@ from vio.records import S_PER_NS, FeatureTracks, IntArray
 class _FitRules:
     """How a lever arm is fitted."""
 
-    blocks: int = 10  # of the jackknife over windows
+    blocks: Tolerance[int] = 10  # of the jackknife over windows
     max_sigma_m: float = 0.02  # with a larger standard deviation the value is not observable
     window_s: float = 1.0
     min_windows: int = 12
@@ -41,7 +41,7 @@ class _JudgeRules:
     """How two lever arms are compared."""
 
     min_intervals: int = 40  # frame intervals needed to judge two lever arms
-    judged_blocks: int = 12  # of the jackknife over them
+    judged_blocks: Tolerance[int] = 12  # of the jackknife over them
     min_sigma: float = 0.1  # lower bound: a jackknife over few blocks is unreliable below this
     log_odds: float = 10.0  # log-likelihood ratio that decides between two lever arms
 

@@ -12,8 +12,9 @@ from typing import Annotated, TypeAlias, TypeVar
 
 T = TypeVar("T")
 
-# Where a series of steps ends, how long the steps of a numeric derivative are, what counts as zero,
-# what stands for infinity: results agree to the precision that is asked of them.
+# Where a series of steps ends, how long the steps of a numeric derivative are, into how many blocks a
+# jackknife divides, what counts as zero, what stands for infinity: results agree to the precision
+# that is asked of them.
 Tolerance: TypeAlias = Annotated[T, "tolerance"]
 # Of memory, queues, batches and pauses, and of what is done beforehand: time and memory differ,
 # results do not.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from vio.geometry.lenses.model import (
@@ -14,7 +16,7 @@ from vio.geometry.lenses.model import (
     plane_by_point,
 )
 from vio.geometry.lie import FloatArray
-from vio.numerics.kinds import Tolerance
+from vio.numerics.kinds import Capacity, Tolerance
 
 _MIN_DEPTH: Tolerance[float] = 1e-9
 
@@ -53,7 +55,7 @@ class Pinhole(Lens):
         colmap={0: ("PINHOLE", 0)},
     )
     planar = True
-    linear_tiles = 4
+    linear_tiles: ClassVar[Capacity[int]] = 4
 
     def project(self, c: Coefficients, p: FloatArray) -> tuple[FloatArray, BoolArray]:
         return pinhole(p)
