@@ -92,7 +92,7 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "left alone": (lambda n: not _kept(int(n)), 9, 10),
     "output: probation": (lambda n: _output(100, int(n), 100) == 100 and n >= 1, 0, 1),
     "output: few": (lambda n: _output(100, 3, int(n)) < 100, 22, 28),
-    "grid: cells": (lambda n: grid_shape(640, 480, GRID)[1] < n, 5, 7),
+    "grid: cells": (lambda n: grid_shape(640, 480, GRID)[1] < n, 6, 7),
     "grid: distance": (lambda n: min_distance_px(640, 480, GRID) < n, 7, 9),
     "prediction: rotation": (lambda x: not _is_rotation(x), 0.9e-3, 1.1e-3),
 }
