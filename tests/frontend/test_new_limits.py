@@ -9,14 +9,14 @@ import pytest
 
 from tests.frontend.test_frontend_scene import CAMERA
 from vio.frontend.columns import changed
-from vio.frontend.detect import grid_shape, min_distance_px
+from vio.frontend.detect import detect_corners, grid_shape, min_distance_px
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.outliers import Consensus
 from vio.frontend.prediction import usable_prior
 from vio.frontend.settings import GridSettings
 from vio.frontend.tracks import AnchorBank, Tracks, new_tracks
 from vio.geometry.lie import se3_exp
-from vio.records import IntArray, TrackPrior
+from vio.records import Image, IntArray, TrackPrior
 
 Says = Callable[[float], bool]
 GRID = GridSettings(target_features=100)
@@ -100,5 +100,40 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
 
 @pytest.mark.parametrize(("says", "below", "above"), LIMITS.values(), ids=LIMITS)
 def test_limits_of_new_features(says: Says, below: float, above: float) -> None:
+    assert not says(below)
+    assert says(above)
+
+
+# Corners of an image
+
+
+def _half(contrasts: dict[tuple[int, int], float], noise: float = 0.0) -> Image:
+    """An image (120, 160) with squares of 8 pixels at (x, y), brighter by their contrasts."""
+    image = np.full((120, 160), 100.0)
+    for (x, y), contrast in contrasts.items():
+        image[y : y + 8, x : x + 8] += contrast
+    image += noise * np.random.default_rng(0).normal(size=image.shape)
+    return np.clip(np.round(image), 0, 255).astype(np.uint8)
+
+
+def _found(image: Image, x: int, y: int, wanted: int = 60, features: int = 12) -> bool:
+    """Whether a corner is found at the square at (x, y)."""
+    grid = GridSettings(target_features=features)
+    corners = detect_corners(image, np.zeros((0, 2)), wanted, grid) / 2
+    return bool(len(corners)) and bool((np.abs(corners - [x + 4, y + 4]).max(axis=1) < 7).any())
+
+
+CORNERS: dict[str, tuple[Says, float, float]] = {
+    "beside a stronger one": (
+        lambda x: _found(_half({(60, 14): 150.0, (60, 36): x}), 60, 36),
+        19.0,
+        27.0,
+    ),
+    "in noise": (lambda x: _found(_half({(60, 40): x}, 2.0), 60, 40, features=100), 3.5, 4.6),
+}
+
+
+@pytest.mark.parametrize(("says", "below", "above"), CORNERS.values(), ids=CORNERS)
+def test_limits_of_corners(says: Says, below: float, above: float) -> None:
     assert not says(below)
     assert says(above)
