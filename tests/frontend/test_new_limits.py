@@ -71,6 +71,13 @@ def _output(count: int, age: int, proven: int) -> int:
     return int(_new().output(_tracks(count, proven, age)).shown.sum())
 
 
+def _output_of_new(age: int) -> bool:
+    """Whether matched features of an age are output beside as many old ones."""
+    tracks = _tracks(100, 100, 5)
+    tracks = changed(tracks, age=np.where(np.arange(100) < 50, 5, age))
+    return int(_new().output(tracks).shown.sum()) == 100
+
+
 def _kept(left_only: int) -> bool:
     return len(_new()._without_old_left_only(_tracks(3, 0, 5, left_only)).ids) > 0
 
@@ -90,7 +97,7 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "corners: no depth": (lambda n: len(_chosen(60, int(n), False, True)) == 0, 33, 37),
     "corners: stay": (lambda x: not _stays(x), 0.68, 0.83),
     "left alone": (lambda n: not _kept(int(n)), 9, 10),
-    "output: probation": (lambda n: _output(100, int(n), 100) == 100 and n >= 1, 0, 1),
+    "output: probation": (lambda n: _output_of_new(int(n)), 0, 1),
     "output: few": (lambda n: _output(100, 3, int(n)) < 100, 22, 28),
     "grid: cells": (lambda n: grid_shape(640, 480, GRID)[1] < n, 6, 7),
     "grid: distance": (lambda n: min_distance_px(640, 480, GRID) < n, 7, 9),
