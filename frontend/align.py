@@ -21,6 +21,7 @@ from vio.dataclass import dataclass
 from vio.frontend.patches import Patches
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled, compiled_sums, invert_positive
+from vio.numerics.kinds import Tolerance
 from vio.records import BoolArray, Image, IntArray
 
 _PARAMETERS = 8  # shift u, v; gain; offset; linear part in row-major order
@@ -41,12 +42,14 @@ _SIGMAS = _FitSigmas()
 _ROW_WEIGHT = (_SIGMAS.gray / _SIGMAS.row_px) ** 2
 MAX_MOVE_PX = 2.5  # of a fitted pixel from its start; beyond, it has left the correlation peak
 # step at which a template has converged; the remaining error is a small fraction of it
-_DONE_PX = 0.05
+_DONE_PX: Tolerance[float] = 0.05
 _MIN_SCORE = 0.1  # that a standard deviation is computed with
-_MAX_SCORE = 0.99999
+_MAX_SCORE: Tolerance[float] = 0.99999
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
-_DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured directions
+_DAMPING: Tolerance[float] = (
+    1e-6  # relative to the diagonal: limits the step in weakly textured directions
+)
 # of the radius, up to which a template must be inside the image: most of its weight
 INSIDE = 2.0 * _SIGMAS.window_share
 # anchors are cut at multiples of this fraction of a pixel, where the weights of float32 are exact

@@ -35,6 +35,7 @@ from vio.frontend.tracks import ANCHOR_RADIUS_PX
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, triangulate
 from vio.numerics.compiled import compiled, compiled_sums
+from vio.numerics.kinds import Tolerance
 from vio.records import (
     BoolArray,
     CheckedFrame,
@@ -57,15 +58,15 @@ class _MatchRules(NamedTuple):
     search_share: float = 0.06
     # largest reprojection error of a static feature under the consensus motion
     inlier_px: float = 1.5
-    far_m: float = 1e6  # depth assumed where it is unknown
-    min_depth_m: float = 0.05
+    far_m: Tolerance[float] = 1e6  # depth assumed where it is unknown
+    min_depth_m: Tolerance[float] = 0.05
     # key points closer to the image border are dropped: their patch would not fit
     border_px: float = 8.0
 
 
 _MATCHES = _MatchRules()
 _MAX_ROW_DIFFERENCE_PX = 1.5  # of a stereo match
-_REFINEMENTS = 6  # iterations on a match
+_REFINEMENTS: Tolerance[int] = 6  # iterations on a match
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from vio.frontend.patches import ImageLevels, inside, mean_and_contrast
 from vio.frontend.tracks import ANCHOR_REACH_PX
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.records import BoolArray, Image
 
 
@@ -22,12 +23,12 @@ class _Flow:
     """How features are followed by Lucas-Kanade, and found again."""
 
     window_px: int = 11  # side of the window, of the half-resolution image
-    lk_epsilon_px: float = 0.02  # of the half-resolution image
-    lk_min_eigenvalue: float = 1e-4  # as OpenCV's own default
+    lk_epsilon_px: Tolerance[float] = 0.02  # of the half-resolution image
+    lk_min_eigenvalue: Tolerance[float] = 1e-4  # as OpenCV's own default
     # share of lost points above which tracking is repeated with all pyramid levels
     retry_share: float = 0.25
     lost_share: float = 0.5  # the same for the last attempt, which starts from the old pixels
-    stride: int = 4  # brightness is computed from every fourth pixel of the half image
+    stride: Capacity[int] = 4  # brightness is computed from every fourth pixel of the half image
     min_contrast: float = 1.0  # gray levels, lower bound of the contrast in the gain
     max_contrast_change: float = 0.06  # relative change of contrast, and
     # change of the mean gray level, up to which images are not adjusted
@@ -42,7 +43,7 @@ class _TrackingRules(NamedTuple):
     """How flow is tracked and checked."""
 
     trusted_levels: int = 1  # pyramid levels above half resolution where the pixels are predicted
-    iterations: int = 20  # per level
+    iterations: Tolerance[int] = 20  # per level
     max_forward_backward_px: float = 1.5
 
 

@@ -29,10 +29,11 @@ from vio.frontend.tracks import (
     no_tracks,
 )
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Capacity
 from vio.protocols import Detector
 from vio.records import CheckedFrame, FrontendOutput, SigmaArray, StereoFrame, TrackPrior
 
-_BANK_FACTOR = 3  # templates allocated, over the number of features
+_BANK_FACTOR: Capacity[int] = 3  # templates allocated, over the number of features
 
 
 class KltFrontend:

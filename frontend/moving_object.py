@@ -43,6 +43,7 @@ from vio.frontend.outliers import (
 )
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
+from vio.numerics.kinds import Tolerance
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, MotionPrior
 
@@ -71,7 +72,7 @@ class _AgreementRules(NamedTuple):
 
     # share of a consensus without depths that a measured motion must explain
     min_static_share: float = 0.8
-    far_m: float = 1e4  # depth of what is infinitely far away
+    far_m: Tolerance[float] = 1e4  # depth of what is infinitely far away
 
 
 _AGREEMENT = _AgreementRules()

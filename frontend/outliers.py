@@ -27,6 +27,7 @@ from vio.frontend.columns import share_of
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, project
 from vio.numerics.compiled import compiled, move_by_twist, solve_positive
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import median
 from vio.records import BoolArray, IntArray
 
@@ -41,9 +42,9 @@ class _RansacRules(NamedTuple):
     prior_min_support_share: float = 0.4
     min_points: int = 8  # with fewer points, a consensus may be chance
     min_share: float = 0.2  # smallest share of inliers of a consensus
-    max_refine_steps: int = 6
+    max_refine_steps: Tolerance[int] = 6
     # change of a motion, in radians and metres, below which it is not refined further
-    converged_change: float = 3e-6
+    converged_change: Tolerance[float] = 3e-6
 
 
 _RANSAC = _RansacRules()
@@ -59,15 +60,15 @@ class _ConsensusRules(NamedTuple):
     prior_points: int = 64  # predicted pixels that are used
     prior_px: float = 2.0  # median distance from them below which a motion represents them
     # change of that motion, in radians and metres, below which it is not refined further
-    prior_converged: float = 1e-4
-    max_sample_steps: int = 5
-    damping: float = 1e-4
+    prior_converged: Tolerance[float] = 1e-4
+    max_sample_steps: Tolerance[int] = 5
+    damping: Tolerance[float] = 1e-4
     # two views constrain a track in one direction only, so most tracks must be inliers
     min_bearing_share: float = 0.5
     # share of inliers of a predicted rotation above which no other rotation is tried
     sure_bearing_share: float = 0.9
     five_point_confidence: float = 0.999
-    epsilon: float = 1e-9  # added to denominators
+    epsilon: Tolerance[float] = 1e-9  # added to denominators
     # of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as
     # large
     min_forward: float = 0.5

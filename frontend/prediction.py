@@ -12,13 +12,14 @@ from vio.frontend.tracks import Tracks
 from vio.geometry.lie import FloatArray, se3_from_parts
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled, index_of
+from vio.numerics.kinds import Tolerance
 from vio.records import BoolArray, Image, IntArray, TrackPrior
 
 _I3 = np.eye(3)
 _ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
 _MIN_DEPTH_M = 0.1
 _NEIGHBOURS = 3  # matched features whose median depth replaces an unknown one
-_FAR_M = 1e6  # depth assumed where too few features have one
+_FAR_M: Tolerance[float] = 1e6  # depth assumed where too few features have one
 
 
 def _is_rotation(R: FloatArray) -> bool:

@@ -52,13 +52,16 @@ _SAME_RESULTS = pytest.mark.skipif(
 )
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest files first; `--no-loadscope-reorder` keeps this order among the workers."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Put the longest files first among workers, where `--no-loadscope-reorder` keeps this order;
+    alone, tools/mutate.py wants the quickest first, as it names them.
+    """
     for item in items:
         if item.path.stem == "test_same_results":
             item.add_marker(_SAME_RESULTS)
-    rank = {name: k for k, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+    if hasattr(config, "workerinput"):
+        rank = {name: k for k, name in enumerate(LONGEST)}
+        items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -6,7 +6,8 @@
 `frontend/`:
 
 - *module constants that are numbers*: names assigned at the top of a module (fields of records
-  are not) whose value is made of numbers alone: `0.5`, `-3`, `2 * 10**6`, `(3, 5)`;
+  are not) whose value is made of numbers alone: `0.5`, `-3`, `2 * 10**6`, `(3, 5)`; those *that
+  decide* are not declared with a kind of `vio/numerics/kinds.py`;
 - *syntax nodes a code line*: all nodes that `ast.walk` visits, over the lines that hold code, which
   docstrings and comments are not;
 - *arguments*: all that a function declares, without `self`, `cls`, `*args` and `**kwargs`;
@@ -32,6 +33,7 @@ from typing import TypeAlias
 from tools.parts import part_of, read_edges, source_files, wrong_way
 
 ROOT = Path(__file__).resolve().parent.parent
+KINDS = ("Tolerance", "Capacity")  # of constants that decide nothing
 MAX_ARGUMENTS = 7
 MAX_COMPLEXITY = 10
 MAX_COMPLEXITY_ANYWHERE = 20
@@ -73,6 +75,7 @@ class Measures:
     code_lines: int
     nodes: int
     constants: tuple[str, ...]  # "module NAME"
+    deciding: tuple[str, ...]  # those of no kind
     functions: tuple[FunctionForm, ...]
     klt_imports: tuple[str, ...]
     edges: tuple[tuple[str, str], ...]
@@ -92,13 +95,16 @@ def measure(root: Path) -> Measures:
     code_lines = 0
     nodes = 0
     constants: list[str] = []
+    deciding: list[str] = []
     functions: list[FunctionForm] = []
     for module, path in source_files(root).items():
         text = path.read_text(encoding="utf-8")
         tree = ast.parse(text)
         code_lines += len(_code_lines(text) - _lines_of(_docstrings(tree)))
         nodes += sum(1 for _ in ast.walk(tree))
+        decisions = ast.Module([n for n in tree.body if kind_of(n) is None], type_ignores=[])
         constants += [f"{module} {name}" for name in number_constants(tree)]
+        deciding += [f"{module} {name}" for name in number_constants(decisions)]
         functions += [
             FunctionForm(
                 f"{path.relative_to(root)}:{node.lineno} {node.name}",
@@ -113,6 +119,7 @@ def measure(root: Path) -> Measures:
         code_lines=code_lines,
         nodes=nodes,
         constants=tuple(constants),
+        deciding=tuple(deciding),
         functions=tuple(functions),
         klt_imports=tuple(b for a, b in edges if a == "vio.frontend.klt"),
         edges=tuple(edges),
@@ -132,6 +139,18 @@ def number_constants(tree: ast.Module) -> Iterator[str]:
             and _is_number(node.value)
         ):
             yield node.target.id
+
+
+def kind_of(node: ast.stmt) -> str | None:
+    """Return the kind that a constant is declared with, see `vio/numerics/kinds.py`; None: it
+    decides.
+    """
+    if not (isinstance(node, ast.AnnAssign) and isinstance(node.annotation, ast.Subscript)):
+        return None
+    kind = node.annotation.value
+    if isinstance(node.annotation.slice, ast.Subscript):  # ClassVar[Capacity[int]]
+        kind = node.annotation.slice.value
+    return kind.id if isinstance(kind, ast.Name) and kind.id in KINDS else None
 
 
 def count_arguments(node: _Function) -> int:
@@ -213,6 +232,7 @@ def table(measures: Measures) -> str:
     rows = {
         "code lines": f"{measures.code_lines:,}",
         "module constants that are numbers": f"{len(measures.constants):,}",
+        "of them, constants that decide": f"{len(measures.deciding):,}",
         "syntax nodes a code line": f"{measures.nodes / max(measures.code_lines, 1):.2f}",
         "functions": f"{many:,}",
         f"functions with more than {MAX_ARGUMENTS} arguments": f"{len(arguments)} "

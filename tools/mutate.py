@@ -10,7 +10,8 @@ and a test is missing. At the end the tests that detected something run on an un
 all must pass. Recordings are taken from VIO_DATA.
 
 With --constants, N constants are drawn from a seed in place of the list, from each part by its
-share: numbers at the top of a module, each times and over 1.5 (whole numbers by one at least). The
+share: numbers at the top of a module, each times and over 1.5 (whole numbers by one at least), but
+those that are declared as a Tolerance or a Capacity (`vio/numerics/kinds.py`) and decide nothing. The
 tests of such a mutation are those of the list for its file, the test files that name its module,
 those of whole results, and those in the folder of its package that name a module which imports it,
 ten at most.
@@ -43,7 +44,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tools.measures import number_constants
+from tools.measures import kind_of, number_constants
 from tools.parts import PARTS, part_of, read_edges, source_files
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -146,19 +147,21 @@ class _TestsOf:
         }
 
     def __call__(self, module: str, file: str) -> tuple[str, ...]:
-        """Those of the list for its file, those of its name, those that name it, those of whole
-        results that it is part of, and those in the folder of its package that name a module which
-        imports it (where there are none, all that do), in this order. Tests of the whole project
-        name modules for other reasons.
+        """Tables of limits that name it, those of the list for its file, those of its name, those
+        that name it, those of whole results that it is part of, and those in the folder of its
+        package that name a module which imports it (where there are none, all that do), in this
+        order. Tests of the whole project name modules for other reasons.
         """
         name = module.rpartition(".")[2]
-        own = sorted(self._naming(module), key=lambda test: name not in test)
+        naming = self._naming(module)
+        quick = [test for test in naming if test.endswith("limits.py")]
+        own = sorted(naming, key=lambda test: name not in test)
         whole = [test for test, modules in self._whole.items() if module in modules]
         whole.sort(key=lambda test: not test.startswith(_folder(module)))
         of_users = [test for user in self._users.get(module, []) for test in self._naming(user)]
         inside = [test for test in of_users if test.startswith(_folder(module))]
         more = inside or ([] if own else of_users)
-        tests = [*self._listed.get(file, ()), *own[:2], *whole, *own[2:], *more]
+        tests = [*quick, *self._listed.get(file, ()), *own[:2], *whole, *own[2:], *more]
         of_mechanism = [test for test in tests if not test.startswith("tests/project/")]
         return tuple(dict.fromkeys(of_mechanism or tests))[:_MAX_FILES]
 
@@ -250,7 +253,7 @@ def _scaled(text: str) -> Iterator[tuple[str, str, str, str]]:
         if not isinstance(node, (ast.Assign, ast.AnnAssign)) or node.value is None:
             continue
         target = node.targets[0] if isinstance(node, ast.Assign) else node.target
-        if not isinstance(target, ast.Name) or target.id not in numbers:
+        if not isinstance(target, ast.Name) or target.id not in numbers or kind_of(node):
             continue
         old = ast.get_source_segment(text, node)
         value = ast.get_source_segment(text, node.value)

@@ -19,6 +19,7 @@ from vio.errors import DataError
 from vio.findings import Finding, Integrity
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Tolerance
 
 NS_PER_S = 10**9
 S_PER_NS = 1.0 / NS_PER_S  # products with it and quotients by NS_PER_S differ in the last bit
@@ -45,7 +46,7 @@ class _RotationRules(NamedTuple):
 
 
 _ROTATION = _RotationRules()
-_KNOWN = 1e-8  # a standard deviation below it is rounding
+_KNOWN: Tolerance[float] = 1e-8  # a standard deviation below it is rounding
 _INT64 = np.dtype(np.int64)
 _FLOAT64 = np.dtype(np.float64)
 _BOOL = np.dtype(np.bool_)

@@ -76,12 +76,15 @@ def test_a_checkout_is_measured(tmp_path: Path) -> None:
         ("vio/__init__.py", '"""Top."""\n'),
         ("vio/records.py", "def f() -> None:\n    from vio.runs.folder import g\n"),
         ("vio/runs/folder.py", '"""Two\nlines."""\n\nimport vio.records\n\ng = 1  # one\n'),
+        ("vio/runs/batch.py", "_A: Capacity[int] = 8\n_B: int = 8\n_C: Tolerance = 1e-3\n"),
     ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     measures = measure(tmp_path)
-    assert measures.code_lines == 4
-    assert measures.constants == ("vio.runs.folder g",)
+    assert measures.code_lines == 7
+    batch = ("vio.runs.batch _A", "vio.runs.batch _B", "vio.runs.batch _C")
+    assert measures.constants == (*batch, "vio.runs.folder g")
+    assert measures.deciding == (*batch[1:], "vio.runs.folder g")
     assert measures.edges == (
         ("vio.records", "vio.runs.folder"),
         ("vio.runs.folder", "vio.records"),

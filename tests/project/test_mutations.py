@@ -79,11 +79,13 @@ _LONG = (
     2.0
 )
 _ZERO = 0
+_STEPS: Tolerance[int] = 9
 _NAME = "1"
 
 
 class _Rules(NamedTuple):
     share: float = 0.25  # of all
+    queue: Capacity[int] = 10
 
 
 class _Other(NamedTuple):

@@ -14,12 +14,13 @@ from typing import Any
 from vio.bench.execute import end_processes, failed, perform_job
 from vio.bench.identity import code_and_packages
 from vio.errors import MissingDependencyError, VioError, extra_text
+from vio.numerics.kinds import Capacity
 
 log = logging.getLogger(__name__)
 Job = dict[str, Any]
 Record = dict[str, Any]
 Perform = Callable[[Job, str], Record]
-_POLL_S = 0.5
+_POLL_S: Capacity[float] = 0.5
 
 
 def run_here(

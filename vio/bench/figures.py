@@ -15,6 +15,7 @@ from vio.evaluation.consistency import nees
 from vio.evaluation.trajectories import Evaluation
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log
 from vio.geometry.upright import yaw_and_position
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
 _OF_REFERENCE = (
@@ -29,12 +30,12 @@ _OF_LOOPS = ("loops", "loops_false", "loop_error_m", "loop_recall")
 _OF_PLACES = ("placed", "place_s", "map_causal_ate_m", "map_nees", "map_nees_50", "map_nees_95")
 _OF_COVERS = ("again_s", "placed_again")
 _OF_MAPS = ("map_ate_m", "placed_wrong", *_OF_LOOPS, *_OF_PLACES, *_OF_COVERS)
-_CURVE = 240  # points of the error over time that are kept; a report shows no more
+_CURVE: Capacity[int] = 240  # points of the error over time that are kept; a report shows no more
 _QUANTILES = (0, 5, 25, 50, 75, 95, 100)
 _FRAME_NS = 10_000_000  # a pose within 10 ms of a frame is that frame's, as in `vio eval`
 # Condition of a pose covariance below which it is inverted: the first frames of a run know their
 # pose exactly.
-_MAX_CONDITION = 1e14
+_MAX_CONDITION: Tolerance[float] = 1e14
 
 
 def figures_of(evaluation: Evaluation, *, positions_only: bool) -> dict[str, Any]:

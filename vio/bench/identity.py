@@ -17,12 +17,13 @@ from typing import Any, Literal
 from vio.datasets import MODULES
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
+from vio.numerics.kinds import Capacity
 
 Identity = Literal["content", "stat"]
 ROOT = Path(__file__).resolve().parent.parent.parent
 _PACKAGES = ("numpy", "scipy", "opencv-python-headless", "numba")  # whose versions may change bits
 _IMPORT = re.compile(r"^( *)(?:from|import) (vio[\w.]*)(?: import (\([^)]*\)|.*))?$", re.MULTILINE)
-_BLOCK = 2**20
+_BLOCK: Capacity[int] = 2**20
 
 
 def digest_of(value: Any) -> str:

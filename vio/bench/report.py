@@ -17,11 +17,12 @@ import numpy as np
 from vio.bench.suite import Suite
 from vio.bench.tables import METRICS, Outcome, Row, markdown
 from vio.files.atomic import atomic_write_text
+from vio.numerics.kinds import Capacity
 
 log = logging.getLogger(__name__)
 _COLOURS = ("#1f5fbf", "#d9822b", "#5aa469", "#c23b5a", "#8e63b8", "#6b7785", "#b59f3b", "#2a9d8f")
 _MAX_SEQUENCES = 24  # with figures of their own: the worst ones of a larger suite
-_MAX_POINTS = 500  # of a box: evenly spaced among the sorted ones of a larger suite
+_MAX_POINTS: Capacity[int] = 500  # of a box: evenly spaced among the sorted ones of a larger suite
 _STYLE = (
     "body{font:15px/1.45 system-ui,sans-serif;max-width:1180px;margin:2em auto;padding:0 "
     "1em;color:#1b2733}"

@@ -45,6 +45,7 @@ from vio.evaluation.field_agreement import disparity_field
 from vio.evaluation.trajectories import MIN_POSES, Evaluation, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
+from vio.numerics.kinds import Capacity
 from vio.protocols import Dataset
 from vio.records import NS_PER_S, BoolArray, IntArray, Recording, Trajectory
 
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
     from vio.runs.pipeline import RunResult
 
 # in which compiled functions are loaded: left out of the CPU time a frame, as its wall times
-_WARM_FRAMES = 8
+_WARM_FRAMES: Capacity[int] = 8
 _MAX_WARNINGS = 5
 JOB = "job.json"
 RESULT = "result.json"

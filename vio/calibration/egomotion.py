@@ -14,6 +14,7 @@ from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.numerics.compiled import compiled, move_by_twist, solve_positive
+from vio.numerics.kinds import Tolerance
 from vio.records import S_PER_NS, BoolArray, FeatureTracks, IntArray
 
 
@@ -31,7 +32,7 @@ _MOTION = _MotionRules()
 _WIDTHS_PX = (30.0, 15.0, 8.0, 4.0, 2.0, 2.0)
 _MIN_DEPTH_M = 0.5
 # relative size of a normal matrix's smallest eigenvalue below which a motion is not determined
-_DEGENERATE = 1e-9
+_DEGENERATE: Tolerance[float] = 1e-9
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,11 @@ from vio.calibration.egomotion import CameraMotion
 from vio.calibration.findings import NotObservable
 from vio.calibration.inertial import ImuAlignment, Rates
 from vio.geometry.lie import FloatArray, nearest_rotation, so3_exp, so3_log
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import jackknife, robust_sigma
 from vio.records import S_PER_NS, BoolArray
 
-_BLOCKS = 10  # of the jackknife
+_BLOCKS: Tolerance[int] = 10  # of the jackknife
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +23,7 @@ class _FitRules:
 
     rotation_deg: float = 1.0  # standard deviation of the rotation beyond which it is called weak
     largest_offset_s: float = 0.1
-    offset_step_s: float = 0.004
+    offset_step_s: Tolerance[float] = 0.004
     # rad/s per m/s: weight of a velocity's error relative to a rotation rate's
     velocity_weight: float = 0.02
 

@@ -14,6 +14,7 @@ from vio.calibration.inertial import ImuAlignment, Rates
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import jackknife, robust_sigma
 from vio.records import S_PER_NS, FeatureTracks, IntArray
 
@@ -22,14 +23,14 @@ from vio.records import S_PER_NS, FeatureTracks, IntArray
 class _FitRules:
     """How a lever arm is fitted."""
 
-    blocks: int = 10  # of the jackknife over windows
+    blocks: Tolerance[int] = 10  # of the jackknife over windows
     max_sigma_m: float = 0.02  # with a larger standard deviation the value is not observable
     window_s: float = 1.0
     min_windows: int = 12
     huber: float = 2.0  # standard deviations
-    reweightings: int = 4
+    reweightings: Tolerance[int] = 4
     # keeps the fit solvable where a recording never accelerates or never rotates
-    ridge: float = 1e-9
+    ridge: Tolerance[float] = 1e-9
 
 
 _FIT = _FitRules()
@@ -40,7 +41,7 @@ class _JudgeRules:
     """How two lever arms are compared."""
 
     min_intervals: int = 40  # frame intervals needed to judge two lever arms
-    judged_blocks: int = 12  # of the jackknife over them
+    judged_blocks: Tolerance[int] = 12  # of the jackknife over them
     min_sigma: float = 0.1  # lower bound: a jackknife over few blocks is unreliable below this
     log_odds: float = 10.0  # log-likelihood ratio that decides between two lever arms
 

@@ -18,6 +18,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, so3_exp
 from vio.geometry.stereo import StereoCamera, left_rays
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import robust_sigma
 from vio.records import BoolArray
 
@@ -35,11 +36,12 @@ class _Fit(NamedTuple):
     prior_p2: float = 2e-3  # of tangential distortion that a calibration leaves
     # three of these: with more, outliers or points that move have led to another minimum
     max_p2: float = 6e-3
-    step: float = 1e-6  # of numeric derivatives by angles, distortion, motion and points
-    iterations: int = 12
-    converged: float = 1e-4  # squared standard deviations that a step is long
+    step: Tolerance[float] = 1e-6  # of numeric derivatives by angles, distortion, motion and points
+    iterations: Tolerance[int] = 12
+    # squared standard deviations that a step is long
+    converged: Tolerance[float] = 1e-4
     min_disparity_px: float = 0.5  # of points from which the motion starts
-    rounding: float = 1e-9  # share of normal equations below which they are none
+    rounding: Tolerance[float] = 1e-9  # share of normal equations below which they are none
 
 
 _FIT = _Fit()

@@ -13,6 +13,7 @@ import numpy as np
 from vio.calibration.findings import NotObservable
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, so3_exp, so3_log
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import robust_sigma
 from vio.records import BoolArray, IntArray
 
@@ -20,7 +21,7 @@ from vio.records import BoolArray, IntArray
 class _ResidualRules(NamedTuple):
     """From how much a calibration is judged."""
 
-    blocks: int = 10  # of a jackknife
+    blocks: Tolerance[int] = 10  # of a jackknife
     min_matches: int = 150
     cells: int = 5  # across the image, a side of the grid on which residuals show a distortion
 

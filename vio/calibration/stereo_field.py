@@ -32,6 +32,7 @@ from vio.geometry.distortion import (
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import MapArray, rectified_cameras, rectify_pixels
 from vio.geometry.stereo import StereoCamera, left_rays
+from vio.numerics.kinds import Tolerance
 from vio.records import (
     FIELD_TERMS,
     RIGHT_TERMS,
@@ -89,9 +90,11 @@ class _FitRules(NamedTuple):
     """The numeric fit of the parameters."""
 
     # of numeric derivatives by the parameters, which are all of the size of radians
-    step_rad: float = 1e-6
-    max_steps: int = 15  # of Gauss-Newton; the weights of the prior need them
-    settled_sigmas: float = 1e-4  # standard deviations of a step after which there is no other
+    step_rad: Tolerance[float] = 1e-6
+    max_steps: Tolerance[int] = 15  # of Gauss-Newton; the weights of the prior need them
+    settled_sigmas: Tolerance[float] = (
+        1e-4  # standard deviations of a step after which there is no other
+    )
 
 
 _FIT = _FitRules()

@@ -9,12 +9,13 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Capacity
 
 # fu, fv, cu, cv (pixels), baseline (m), whether the projection is a cylinder
 CameraArgs: TypeAlias = tuple[float, float, float, float, float, bool]
 
 
-_MAX_KNOWN = 8
+_MAX_KNOWN: Capacity[int] = 8
 # by identity: a camera's hash costs more than the answer
 _known: dict[int, tuple[StereoCamera, CameraArgs]] = {}
 

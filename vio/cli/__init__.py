@@ -31,6 +31,7 @@ from vio._version import __version__
 from vio.cli.waiting import SilenceBroken
 from vio.errors import NOTE, StoppedError, VioError
 from vio.files.printable import printable
+from vio.numerics.kinds import Capacity
 
 # The commands by what they are for, and the files of those that have another name.
 BY_PURPOSE = {
@@ -57,7 +58,7 @@ COMMANDS = tuple(name for names in BY_PURPOSE.values() for name in names)
 
 # Objects made before Python looks for cycles among the young ones: a tenth of a command's start
 # went into that search, over modules and samples that stay. At its end, another tenth did.
-_GC_OBJECTS = 100_000
+_GC_OBJECTS: Capacity[int] = 100_000
 # bytes; a short run of MH_01 takes 976 MB, and OpenCV fails to load in 820
 _MIN_ADDRESS_SPACE = 1_000_000_000
 _LIGHT = ("config", "completion")  # commands that load no library

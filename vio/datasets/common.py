@@ -24,6 +24,7 @@ from vio.errors import CalibrationError, DataError
 from vio.files.inputs import check_regular
 from vio.files.text import check_increasing
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 from vio.records import NS_PER_S, BoolArray, Event, IntArray, MotionSample, Recording, StereoFrame
 
 
@@ -49,7 +50,7 @@ _DAMAGE = (
     lzma.LZMAError,
     struct.error,
 )
-_EXACT_ENTRY = 1e-8  # tolerance of the zeros and the one of an intrinsic matrix
+_EXACT_ENTRY: Tolerance[float] = 1e-8  # tolerance of the zeros and the one of an intrinsic matrix
 
 
 def check_gravity_column(values: FloatArray, where: str, form: str, remedy: str) -> None:

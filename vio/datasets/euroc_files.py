@@ -41,12 +41,13 @@ from vio.geometry.lie import (
     se3_inverse,
 )
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Tolerance
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
 
 STATE_CSV = Path("state_groundtruth_estimate0", "data.csv")  # ground truth, within mav0
 TUM_FILE = "groundtruth_tum.txt"  # ground truth beside mav0
 # units in the last place within which a translation is looked for that is read back as it was
-_ULPS = 2
+_ULPS: Tolerance[int] = 2
 _IMAGES_HEADER = "#timestamp [ns],filename"
 _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"

@@ -27,6 +27,7 @@ from vio.datasets.png import MAX_PIXELS, crc32, decode_gray8
 from vio.errors import DataError
 from vio.files.inputs import check_regular, read_input
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 
 OTHER_SUFFIXES = (".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp")
@@ -50,7 +51,9 @@ _EXIF_TURNS = {
     7: "mirrored and turned by 90 degrees",
     8: "turned by 270 degrees",
 }
-_PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
+_PNG_LEVEL: Capacity[int] = (
+    1  # files a tenth larger than at the usual level 3, in a third of the time
+)
 
 
 Item = TypeVar("Item")

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 
-_SIDE_BY_SIDE = 16  # rows, as many as a vector of the processor holds numbers of 16 bits
+_SIDE_BY_SIDE: Capacity[int] = (
+    16  # rows, as many as a vector of the processor holds numbers of 16 bits
+)
 _PAETH = 4  # number of the filter
 
 

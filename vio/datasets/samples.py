@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast, overload
 import numpy as np
 
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity
 from vio.records import (
     BoolArray,
     ImuRecord,
@@ -23,7 +24,7 @@ from vio.records import (
 )
 
 Sample_co = TypeVar("Sample_co", bound=ImuSample | VelocitySample, covariant=True)
-_CHUNK = 1000  # samples whose times are plain numbers at once
+_CHUNK: Capacity[int] = 1000  # samples whose times are plain numbers at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)

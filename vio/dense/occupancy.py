@@ -11,6 +11,7 @@ from scipy.ndimage import binary_closing, minimum_filter
 from vio.dense.surface import Mesh
 from vio.files.meshes import FREE, OCCUPIED, UNKNOWN
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +22,7 @@ class _GroundRules:
     clearance_m: float = 2.0  # … below this height; what is higher is passed under
     ground_m: float = 1.5  # radius within which the lowest surface is the ground
     min_vertices: int = 2  # of a cell's ground or obstacle
-    max_cells: int = 1 << 26
+    max_cells: Capacity[int] = 1 << 26
 
 
 _GROUND = _GroundRules()

@@ -20,12 +20,15 @@ from vio.dense.stereo_depth import DISPARITY_SIGMA_PX, DepthImage, slant
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Capacity
 from vio.records import Image, IntArray
 
 SIDE = 8  # samples along a block's edge
 TRUNCATION = 4  # voxels
-MAX_BLOCKS = 1 << 15  # in memory, 200 MB; those farthest from the camera go to a file
-_HALF = 1 << 20  # block coordinates are within it
+MAX_BLOCKS: Capacity[int] = (
+    1 << 15
+)  # in memory, 200 MB; those farthest from the camera go to a file
+_HALF: Capacity[int] = 1 << 20  # block coordinates are within it
 _MAX_WEIGHT = 64.0  # so that a surface that changed is taken over in time
 _SHAPE = (SIDE, SIDE, SIDE)
 BLOCK = np.dtype(

@@ -28,6 +28,7 @@ from vio.geometry.lie import (
     se3_log,
     so3_hat,
 )
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import CUT_OFF_PROBABILITY, MU_GROWTH, truncated_weights
 from vio.numerics.sparse import factors
 from vio.numerics.statistics import chi_square_quantile
@@ -41,14 +42,14 @@ class _AlignmentRules:
     # What odometry drifts by between neighbours beyond its scale: 0.2 m and 0.3 deg over 100 m, as
     # random walks.
     drift_m: float = 0.02  # per square root of a metre
-    min_m: float = 1e-3  # of a motion at standstill
-    min_rad: float = 1e-5
+    min_m: Tolerance[float] = 1e-3  # of a motion at standstill
+    min_rad: Tolerance[float] = 1e-5
     correlated_s: float = 5.0  # errors of GNSS last: positions within it count as one
     # of the antenna beside the stated error: 10 ms of the clocks at 10 m/s, the lever arm
     timing_m: float = 0.1
-    max_steps: int = 40
-    settled: float = 1e-5
-    start_steps: int = 20  # of the robust alignment that it starts from
+    max_steps: Tolerance[int] = 40
+    settled: Tolerance[float] = 1e-5
+    start_steps: Tolerance[int] = 20  # of the robust alignment that it starts from
     min_fixes: int = 3
     height_sigma_m: float = 1e3  # of the first pose, where no position states a height
     metre_per_rad: float = 100.0  # weights a turn of a pose against its position in the rigid fit

@@ -7,11 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 
 _A = 6378137.0  # semi-major axis, m
 _F = 1 / 298.257223563
 _E2 = _F * (2 - _F)
-_HEIGHT_STEPS = 6  # of the fixed point iteration: 1e-9 m within 100 km of the surface
+_HEIGHT_STEPS: Tolerance[int] = (
+    6  # of the fixed point iteration: 1e-9 m within 100 km of the surface
+)
 # UTM: scale on the central meridian, false easting and northing, and Krueger's series in n = f / (2
 # - f).
 _K0 = 0.9996

@@ -19,6 +19,7 @@ from vio.geometry.lie import (
     so3_hat,
     so3_log,
 )
+from vio.numerics.kinds import Tolerance
 
 AlignMode: TypeAlias = Literal["se3", "sim3", "first", "none"]
 RotationSource: TypeAlias = Literal[
@@ -31,7 +32,7 @@ class _AlignmentRules:
     """When positions alone, or orientations too, decide an alignment."""
 
     # ratio of squared extents below which points are collinear, to rounding
-    collinear: float = 1e-13
+    collinear: Tolerance[float] = 1e-13
     # positions determine the rotation about the path if its standard deviation is below 3 degrees
     loose_rad: float = 0.05
     # ratio of standard deviations above which the orientations replace the positions in it
@@ -39,7 +40,7 @@ class _AlignmentRules:
     # standard deviations by which they may differ; more: they do not describe the same body
     contradiction: float = 5.0
     # extent, relative to the size of the coordinates, below which points coincide, to rounding
-    stationary: float = 1e-12
+    stationary: Tolerance[float] = 1e-12
 
 
 _ALIGNMENT = _AlignmentRules()

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import BinaryIO, Literal
 
 from vio.errors import DataError, VioError
+from vio.numerics.kinds import Capacity
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +36,7 @@ _NO_LINK = sum(
 )
 # what makes the name of a file in the making a free one, and its kind
 _LEFT_OVER = re.compile(r"[0-9a-f]{12}\.(partial|old)")
-_PROBE_BYTES = 2**22  # what a run of a thousand frames writes, about
+_PROBE_BYTES: Capacity[int] = 2**22  # what a run of a thousand frames writes, about
 
 
 def _sibling(path: Path, kind: str) -> Path:

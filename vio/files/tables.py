@@ -19,8 +19,9 @@ import numpy.typing as npt
 
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_bytes, check_own, open_own
+from vio.numerics.kinds import Capacity
 
-_CHUNK = 10_000  # rows of which a checksum is computed at a time
+_CHUNK: Capacity[int] = 10_000  # rows of which a checksum is computed at a time
 Rows = np.ndarray  # structured (N,)
 _Record = TypeVar("_Record")
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from vio.errors import DataError
 from vio.files.inputs import read_input
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity
 from vio.records import NS_PER_S, IntArray
 
 INT64_MAX = 2**63 - 1
@@ -23,7 +24,7 @@ _WHOLE = re.compile(r"(\d{1,19})(?:\.0*)?")
 _SIGNED = re.compile(r"([+-]?\d{1,19})(?:\.0*)?")
 # what else than ASCII files of Windows have in units: ° ² ³ µ · ¹ º
 _LATIN = frozenset("°²³µ·¹º")
-_PIECE = 2**16  # characters that are split into lines at a time
+_PIECE: Capacity[int] = 2**16  # characters that are split into lines at a time
 _ROUNDED = 0.05  # share of times that repeat the one before, as rounded ones do
 
 

@@ -32,6 +32,7 @@ from vio.geometry.lie import (
     se3_from_parts,
     se3_inverse,
 )
+from vio.numerics.kinds import Tolerance
 from vio.records import BodyFrame, BoolArray, IntArray, Orientations, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -50,7 +51,7 @@ class _PoseRules(NamedTuple):
     """What a pose of a file may be."""
 
     max_coordinate_m: float = 1e12  # of a coordinate, in metres: beyond, squares overflow
-    exact_deviation: float = 1e-12  # rotations this close to orthonormal keep their bits
+    exact_deviation: Tolerance[float] = 1e-12  # rotations this close to orthonormal keep their bits
 
 
 _POSES = _PoseRules()

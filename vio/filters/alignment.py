@@ -18,17 +18,18 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 from vio.records import BoolArray
 
 
 class _AlignmentRules(NamedTuple):
     """The fit of gyro bias, velocity and gravity to bearings."""
 
-    steps: int = 6
+    steps: Tolerance[int] = 6
     bearing_sigma_rad: float = 2e-3  # rad, a pixel of a usual lens; larger residuals lose weight
     min_shared_tracks: int = 8  # tracks that two views share, for their rotation to be used
-    tiny: float = 1e-12
-    min_depth_m: float = 0.1  # of a point in a weight: a nearer one is noise
+    tiny: Tolerance[float] = 1e-12
+    min_depth_m: Tolerance[float] = 0.1  # of a point in a weight: a nearer one is noise
 
 
 _ALIGNMENT = _AlignmentRules()

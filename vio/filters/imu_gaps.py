@@ -17,6 +17,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.filters.pose_loops import lacks_samples
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.numerics.robust import median
 from vio.records import S_PER_NS, ImuSample, IntArray
 
@@ -26,7 +27,7 @@ class _GapRules:
     """What missing IMU samples may hide."""
 
     memory_s: float = 2.0  # samples that the structure function is learned from
-    max_samples: int = 8000  # of them, whatever their stamps say
+    max_samples: Capacity[int] = 8000  # of them, whatever their stamps say
     # half of it; beyond, the signal is taken to have changed as much as it ever does
     longest_lag_s: float = 1.0
     min_samples: int = 10  # with fewer the signal is not characterised
@@ -39,8 +40,8 @@ class _GapRules:
     # bridges, too
     slow_ns: float = 30e6
     slow_cut_ns: float = 10e6  # of its intervals
-    shortest_cut_ns: float = 1e6  # of a gap, for the integration
-    max_cuts: int = 1000
+    shortest_cut_ns: Tolerance[float] = 1e6  # of a gap, for the integration
+    max_cuts: Capacity[int] = 1000
 
 
 _GAPS = _GapRules()

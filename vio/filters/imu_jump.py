@@ -22,6 +22,7 @@ from vio.filters.track_records import Residuals
 from vio.filters.window import Window
 from vio.filters.window_tracks import VIEW_PROBABILITY, LinearTracks, chi_square_table
 from vio.geometry.lie import FloatArray, so3_hat
+from vio.numerics.kinds import Tolerance
 from vio.records import BoolArray
 
 
@@ -31,7 +32,7 @@ class _RotationRules(NamedTuple):
     min_old_views: int = 4  # of a track before the newest: what it shows has been part of the scene
     min_old_tracks: int = 15
     min_agreeing_share: float = 0.8  # share of the old tracks that one rotation must explain
-    steps: int = 8  # of the robust fit
+    steps: Tolerance[int] = 8  # of the robust fit
 
 
 _ROTATION = _RotationRules()

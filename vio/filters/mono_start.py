@@ -47,6 +47,7 @@ from vio.geometry.stereo import StereoCamera, left_rays
 from vio.geometry.upright import rotation_to_up
 from vio.imu.settings import ImuSettings
 from vio.imu.standstill import STANDSTILL_S
+from vio.numerics.kinds import Tolerance
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import ImuSample, Observations, shared_rows
 
@@ -63,8 +64,10 @@ class _StartRules:
     every: int = 5  # frames between two attempts, whose time is that of a dozen updates
     min_tracks: int = 20
     max_tracks: int = 150
-    steps: int = 30  # of Gauss-Newton at most: where the scale is hardly known it takes twenty
-    converged: float = 1e-3  # m, m/s and rad
+    steps: Tolerance[int] = (
+        30  # of Gauss-Newton at most: where the scale is hardly known it takes twenty
+    )
+    converged: Tolerance[float] = 1e-3  # m, m/s and rad
     still_px: float = 0.5  # median motion of the tracks over half a second at standstill
     # chi-square probability of the fit's distance from the prior, which is that of the IMU
     agreement: float = 0.999

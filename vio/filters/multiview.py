@@ -28,6 +28,7 @@ from vio.filters.track_records import (
 )
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Tolerance
 from vio.records import BoolArray, IntArray
 
 MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
@@ -41,7 +42,7 @@ class _TriangulationRules(NamedTuple):
     chi_square_median: float = 2.37
     # per px^2, information on the disparity: its standard deviation is 1000 px, half of what
     # MIN_DEPTH shows
-    disparity_information: float = 1e-6
+    disparity_information: Tolerance[float] = 1e-6
     # px^2, of the disparity of one stereo view, for one pixel of noise
     stereo_variance_px2: float = 2.0
     # One camera, whose unit of length is arbitrary: standard deviation of an inverse depth over
@@ -49,14 +50,14 @@ class _TriangulationRules(NamedTuple):
     # with one for the learned noise, standstills have too many (docs/notes/design_decisions.md,
     # depth of one camera's tracks).
     mono_depth_sigma: float = 0.15
-    tiny: float = 1e-12  # keeps what nothing was seen of invertible
+    tiny: Tolerance[float] = 1e-12  # keeps what nothing was seen of invertible
     # Gauss-Newton steps on a new point without a stereo view, before any pose has moved
     parallax_steps: int = 3
 
 
 _TRIANGULATION = _TriangulationRules()
 # of a point at infinity: ten baselines of motion move it by a hundredth of a pixel
-MIN_DISPARITY_PX = 1e-3
+MIN_DISPARITY_PX: Tolerance[float] = 1e-3
 
 
 def residuals(

@@ -12,6 +12,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.filters import gate_loops as loops
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 from vio.numerics.statistics import chi_square_cdf, chi_square_quantile
 
 
@@ -28,7 +29,7 @@ class _NoiseRules(NamedTuple):
     log_variance_walk: float = 0.15  # its random walk per sum of steps
     # chi-square probability beyond which a single step is an exception
     surprise_probability: float = 0.9999
-    max_factor: float = 1e6
+    max_factor: Tolerance[float] = 1e6
 
 
 _NOISE = _NoiseRules()

@@ -19,6 +19,7 @@ import numpy as np
 
 from vio.filters import track_loops as loops
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity
 from vio.records import IntArray
 
 # before any track has ended: white noise has 1, front ends on real images 2 to 7
@@ -29,7 +30,7 @@ class _ClusterRules(NamedTuple):
     """How errors that neighbours have in common are learned."""
 
     prior_tracks: float = 30.0  # as many ended tracks count for it
-    max_features: int = 4096  # whose clusters are kept: far more than are seen at once
+    max_features: Capacity[int] = 4096  # whose clusters are kept: far more than are seen at once
     frames: int = 10  # of those in which tracks end, in which neighbours' are one cluster
 
 

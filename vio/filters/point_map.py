@@ -8,9 +8,10 @@ import numpy as np
 
 from vio.filters.window import Window
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity
 from vio.records import IntArray, Landmarks, no_landmarks
 
-_MIN_MERGE = 1000  # stored points up to which the map is not merged
+_MIN_MERGE: Capacity[int] = 1000  # stored points up to which the map is not merged
 
 
 class PointMap:

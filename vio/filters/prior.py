@@ -15,10 +15,11 @@ from vio.dataclass import dataclass
 from vio.filters import pose_loops as loops
 from vio.filters.scale_test import ScaleTest
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 from vio.numerics.scipy_extensions import lapack
 from vio.records import IntArray
 
-_SINGULAR = 1e-12  # of the largest eigenvalue of a matrix of correlations
+_SINGULAR: Tolerance[float] = 1e-12  # of the largest eigenvalue of a matrix of correlations
 
 
 class Prior:

@@ -15,11 +15,12 @@ from vio.filters.prior import Fit
 from vio.filters.window import Clones, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
+from vio.numerics.kinds import Tolerance
 from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import Estimate
 
 # of the largest eigenvalue of a correlation: less is rounding
-_GIVEN_RANK = 1e-10
+_GIVEN_RANK: Tolerance[float] = 1e-10
 _MIN_MOTION_M = 1e-3  # of all poses from the oldest one: less has no scale
 _STATIONARY_LIMIT = float(chi_square_quantile(0.95, 6))  # of the motion over the window
 

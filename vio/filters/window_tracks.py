@@ -36,6 +36,7 @@ from vio.filters.track_records import Residuals, Views
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import median
 from vio.numerics.scipy_extensions import lapack
 from vio.numerics.statistics import chi_square_quantile
@@ -65,7 +66,7 @@ class _TrackRules:
     max_dof: int = 199
     # left of a pose's own, at most: directions that pixels alone do not tell, as where the world
     # is
-    no_information: float = 1e-8
+    no_information: Tolerance[float] = 1e-8
     # of a frame over the learned variance: beyond twice the noise it is no blur
     max_common_noise: float = 4.0
 

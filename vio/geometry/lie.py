@@ -15,11 +15,12 @@ import numpy.typing as npt
 
 from vio.errors import CalibrationError
 from vio.numerics.arrays import FloatArray as FloatArray
+from vio.numerics.kinds import Tolerance
 
-_EXACT = 1e-12  # rotations this close to orthonormal keep their bits
+_EXACT: Tolerance[float] = 1e-12  # rotations this close to orthonormal keep their bits
 # Below this angle the closed forms suffer from cancellation and the Taylor series is exact to
 # rounding.
-_SMALL_ANGLE_RAD = 1e-2
+_SMALL_ANGLE_RAD: Tolerance[float] = 1e-2
 
 
 def so3_hat(phi: npt.ArrayLike) -> FloatArray:

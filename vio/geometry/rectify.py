@@ -25,6 +25,7 @@ from vio.geometry.stereo import (
     one_camera,
     project,
 )
+from vio.numerics.kinds import Capacity, Tolerance
 
 MapArray = npt.NDArray[np.float32]
 Interpolation: TypeAlias = Literal["linear", "cubic", "lanczos4"]
@@ -35,7 +36,7 @@ class _ViewRules(NamedTuple):
     """What of the lenses' views is kept."""
 
     # points along each image border that determine the common field of view
-    border_samples: int = 60
+    border_samples: Tolerance[int] = 60
     # beyond about 54 degrees off axis a planar image only stretches pixels
     max_tangent: float = 1.4
     min_tangent_width: float = 0.1
@@ -47,7 +48,9 @@ _VIEW = _ViewRules()
 PINHOLE_REACH = float(np.arctan(_VIEW.max_tangent))  # radians
 # Of a cylinder's rows, azimuths: further round, the rays of a lens of 195 degrees are its dark rim.
 _MAX_ROW = {"pinhole": _VIEW.max_tangent, "cylinder": np.pi / 2}
-_ROWS = 16  # of a map, computed at a time: the arrays between stay in the processor's cache
+_ROWS: Capacity[int] = (
+    16  # of a map, computed at a time: the arrays between stay in the processor's cache
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from vio.findings import Finding
 from vio.frontend.patches import mean_and_contrast
 from vio.geometry.lie import FloatArray
 from vio.guard.image_check import FrameImages, ImageCheck
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 
 
@@ -34,7 +35,7 @@ class _BandRules:
     memory: int = 10  # frames
     # of an image over the other's: a camera that goes dark now and then has no bands
     min_contrast: float = 0.3
-    stride_px: int = 8  # of the pixels that the contrast is computed from
+    stride_px: Capacity[int] = 8  # of the pixels that the contrast is computed from
     # standard deviation: bands are wider, and horizontal edges of the scene are narrower
     smooth_sigma_rows: float = 3.0
 

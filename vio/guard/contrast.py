@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from vio.frontend.patches import mean_and_contrast
 from vio.guard.image_check import FrameImages, ImageCheck
+from vio.numerics.kinds import Capacity
 
 
 class _ContrastRules(NamedTuple):
@@ -13,7 +14,7 @@ class _ContrastRules(NamedTuple):
 
     # in a row that are left out; then the front end sees them, and drops its tracks
     max_frames: int = 5
-    stride_px: int = 4  # every fourth pixel of the half image is used
+    stride_px: Capacity[int] = 4  # every fourth pixel of the half image is used
     # share of the last image's contrast below which the contrast counts as lost
     lost_share: float = 0.1
 

@@ -15,6 +15,7 @@ from vio.findings import Finding
 from vio.frontend.patches import mean_and_contrast
 from vio.guard.image_change import image_change
 from vio.guard.image_check import FrameImages, ImageCheck
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 
 Cause: TypeAlias = Literal["right-image-frozen", "right-image-dark"]
@@ -24,7 +25,7 @@ Cause: TypeAlias = Literal["right-image-frozen", "right-image-dark"]
 class _FrozenRules:
     """When an image counts as frozen, or as dark."""
 
-    stride: int = 4  # of the half-resolution images' pixels that are compared
+    stride: Capacity[int] = 4  # of the half-resolution images' pixels that are compared
     # change of a frozen camera's image over that of the other's, at most: sensor noise is left
     frozen_share: float = 0.3
     # change of a frozen camera's image by noise of the sensor or an encoder, gray levels at the

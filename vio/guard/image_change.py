@@ -6,6 +6,7 @@ import numpy as np
 
 from vio.frontend.patches import statistics
 from vio.numerics.compiled import compiled, compiled_sums
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 
 # gray levels that both images are scaled to, so that neither exposure nor gain counts as a change
@@ -13,7 +14,7 @@ _CONTRAST = 50.0
 _CLIPPED = 250  # gray level from which a pixel of a resampled image may contain clipped ones
 _MIN_UNCLIPPED = 0.1  # share of the pixels
 _MIN_MOVED = 2.0  # gray levels at the common contrast, of an image after a motion
-_STRIDE = 4  # of the pixels of half images that are compared for it
+_STRIDE: Capacity[int] = 4  # of the pixels of half images that are compared for it
 
 
 def image_change(image: Image, other: Image) -> float:

@@ -26,6 +26,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Capacity
 from vio.numerics.robust import median, robust_sigmas
 from vio.records import S_PER_NS, BoolArray, ImuSample, IntArray
 
@@ -48,8 +49,8 @@ class _FaultRules:
     # changes; with fewer nothing is called a spike, nor stuck: a simulated IMU may have no noise
     min_history: int = 20
     # samples between two evaluations of their scale, and the least share of all, 1 / 4
-    refresh: int = 20
-    refresh_share: int = 4
+    refresh: Capacity[int] = 20
+    refresh_share: Capacity[int] = 4
     spike_sigmas: float = 30.0  # robust standard deviations of the changes; real motion reached 23
     # rad and m/s over the sample's period; below, no spike does harm
     spike_impulse: tuple[float, float, float, float, float, float] = (

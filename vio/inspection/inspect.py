@@ -26,6 +26,7 @@ from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
 from vio.inspection.pictures import calibration_part, depths_part, images_part, rows_part
 from vio.monitor.inertial import InertialCheck
 from vio.monitor.reading import pair_as_read
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import robust_sigma
 from vio.protocols import Dataset, Frontend
 from vio.records import (
@@ -357,7 +358,7 @@ class _StampRules(NamedTuple):
     """What is said of the stamps."""
 
     gap_steps: float = 1.5  # intervals longer than this multiple of the median are gaps
-    even_ms: float = 1e-3  # a jitter below it is rounding of the stamps
+    even_ms: Tolerance[float] = 1e-3  # a jitter below it is rounding of the stamps
     min_imu_hz: float = 50.0  # as the readers say it
 
 

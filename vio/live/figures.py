@@ -11,11 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vio.numerics.kinds import Capacity
+
 
 class _FigureRules(NamedTuple):
     """When a computer is too slow."""
 
-    kept_results: int = 1000  # results that the median and the bound of 95 % are taken of
+    kept_results: Capacity[int] = 1000  # results that the median and the bound of 95 % are taken of
     # results older than that, one after another, mean that the computer is too slow
     late_s: float = 0.5
     late_results: int = 10

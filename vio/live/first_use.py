@@ -26,6 +26,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics import compiling, prebuilt
 from vio.numerics.compiled import is_cached
+from vio.numerics.kinds import Capacity
 from vio.records import IntArray, RunMotion, StereoFrame
 
 log = logging.getLogger(__name__)
@@ -37,13 +38,13 @@ _CAMERA = StereoCamera(300.0, 300.0, 320.0, 180.0, 0.1, 640, 360)
 class _MadeUpRun(NamedTuple):
     """The run that is made up to be compiled for."""
 
-    frames: int = 30
-    step_ns: int = 50_000_000
-    samples_per_frame: int = 10  # of a motion sensor, a frame
-    points: int = 150
-    min_track_frames: int = 4  # frames that a feature is seen in
-    max_track_frames: int = 40
-    noise_px: float = 0.1
+    frames: Capacity[int] = 30
+    step_ns: Capacity[int] = 50_000_000
+    samples_per_frame: Capacity[int] = 10  # of a motion sensor, a frame
+    points: Capacity[int] = 150
+    min_track_frames: Capacity[int] = 4  # frames that a feature is seen in
+    max_track_frames: Capacity[int] = 40
+    noise_px: Capacity[float] = 0.1
 
 
 _RUN = _MadeUpRun()

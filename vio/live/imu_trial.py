@@ -15,10 +15,11 @@ from dataclasses import replace
 
 from vio.errors import DivergedError, EstimationError
 from vio.imu.findings import ImuVerdict
+from vio.numerics.kinds import Capacity
 from vio.protocols import Backend
 from vio.records import Estimate, ImuSample, MotionSample, Observations
 
-_MAX_FRAMES = 600  # that are kept
+_MAX_FRAMES: Capacity[int] = 600  # that are kept
 AS_GIVEN = ImuVerdict()
 
 

@@ -30,6 +30,7 @@ from vio.live.prediction import PredictedPose, SharedPredictor
 from vio.live.sink import LiveSink
 from vio.live.warm_up import warm_up
 from vio.live.worker import DROPS, Drop, QuietCollector, Worker, WorkerState
+from vio.numerics.kinds import Capacity
 from vio.records import Estimate, FrameResult, Landmarks, MotionSample
 
 log = logging.getLogger(__name__)
@@ -37,7 +38,7 @@ log = logging.getLogger(__name__)
 # results after which the points that will not change any more are taken from the filter
 _LANDMARK_FRAMES = 100
 # estimates that wait for the reader; of a slower one, the oldest are forgotten
-_MAX_WAITING = 1000
+_MAX_WAITING: Capacity[int] = 1000
 
 
 class EstimateStream(Iterator[Estimate]):

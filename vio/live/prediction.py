@@ -12,6 +12,7 @@ import numpy as np
 
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.numerics.kinds import Capacity
 from vio.records import S_PER_NS, Estimate, ImuSample, MotionSample, VelocitySample, imu_matrices
 
 
@@ -20,7 +21,9 @@ class _PredictionRules(NamedTuple):
 
     kept_ns: int = 2_000_000_000  # samples that a late estimate can be carried over
     max_step_s: float = 0.5  # a motion is held no longer than this beyond the last sample or frame
-    max_states: int = 10_000  # after the newest estimate: beyond, older ones are forgotten
+    max_states: Capacity[int] = (
+        10_000  # after the newest estimate: beyond, older ones are forgotten
+    )
 
 
 _PREDICTION = _PredictionRules()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from vio.dataclass import dataclass
 from vio.live.frame_pipeline import FramePipeline
+from vio.numerics.kinds import Capacity
 from vio.records import Estimate, Event, FrameResult, MotionSample, StereoFrame
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ LONGEST_WAIT_NS = 100_000_000
 class _WaitRules(NamedTuple):
     """How long a frame waits for samples."""
 
-    max_samples: int = 100_000  # that wait: minutes in which no frame came
+    max_samples: Capacity[int] = 100_000  # that wait: minutes in which no frame came
     min_s: float = 1e-3  # a velocity carries the pose that far as well as the IMU does
     clear_sigmas: float = 3.0  # standard deviations of a time offset that is waited for
 

@@ -18,20 +18,21 @@ from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.odometry import Odometry
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 
 
 class _MadeUpRun(NamedTuple):
     """The images and samples that are made up."""
 
-    frames: int = 40  # samples a frame
-    step_ns: int = 50_000_000
-    samples_per_frame: int = 10
-    far_px: float = 12.0  # disparities of the upper and the lower half of the images
-    near_px: float = 24.0
-    sway_px: float = 60.0  # of the near half, and its period
-    sway_s: float = 2.0
-    smooth_px: float = 1.5
+    frames: Capacity[int] = 40  # samples a frame
+    step_ns: Capacity[int] = 50_000_000
+    samples_per_frame: Capacity[int] = 10
+    far_px: Capacity[float] = 12.0  # disparities of the upper and the lower half of the images
+    near_px: Capacity[float] = 24.0
+    sway_px: Capacity[float] = 60.0  # of the near half, and its period
+    sway_s: Capacity[float] = 2.0
+    smooth_px: Capacity[float] = 1.5
 
 
 _RUN = _MadeUpRun()

@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any, Literal, TypeAlias, TypeVar
 
 from vio.errors import VioError
+from vio.numerics.kinds import Capacity
 
 Answer = TypeVar("Answer")
 Drop: TypeAlias = Literal["oldest", "none", "block"]
@@ -284,7 +285,7 @@ def _named(error: BaseException) -> VioError:
 # Objects more than before until the young ones are searched. Frames make no cycles, so that few are
 # ever found, and what lives in a run is some ten thousand objects, through which a search takes a
 # few milliseconds.
-_YOUNG = 20_000
+_YOUNG: Capacity[int] = 20_000
 
 
 class QuietCollector:

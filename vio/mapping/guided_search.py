@@ -36,6 +36,7 @@ from vio.mapping.loop_geometry import (
 )
 from vio.mapping.overlap import MIN_DEPTH_M, SCALES, VIEW_COS
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Capacity
 from vio.records import IntArray
 
 
@@ -53,7 +54,7 @@ class _Guidance(NamedTuple):
     min_sample: int = 8  # pairs that agree before the next search
     # features closer together are of one corner, on several levels of the pyramid, and count once
     cell_px: float = 8.0
-    rows: int = 1 << 20  # more than an image has
+    rows: Capacity[int] = 1 << 20  # more than an image has
     # by which all points are moved to find the pairs of chance: more than a window of the last
     # search
     aside_px: float = 25.0

@@ -21,6 +21,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate
 from vio.mapping.features import KeyframeFeatures
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Tolerance
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, LoopMatches
 
@@ -32,7 +33,7 @@ class _Fitting:
     """How the motion of a loop is found and judged."""
 
     min_share: float = 0.25  # of the pairs that must agree; wrong pairs are at random
-    worse: int = 1000  # more than the 256 bits in which two descriptors can differ
+    worse: Tolerance[int] = 1000  # more than the 256 bits in which two descriptors can differ
     ratio: float = 0.85  # to the second-best descriptor
     max_pairs: int = 200  # that enter the fit, which takes 4 ms then
     ransac_px: float = 4.0
@@ -41,8 +42,8 @@ class _Fitting:
     same_m: float = 0.1  # by which both directions may differ; metres, beside a share of the depth
     same_deg: float = 3.0
     same_depth: float = 0.05
-    max_steps: int = 10
-    converged: float = 1e-5  # change, m and rad
+    max_steps: Tolerance[int] = 10
+    converged: Tolerance[float] = 1e-5  # change, m and rad
     gate: float = 3.0  # standard deviations, of a pixel coordinate
     # Floor of a loop's standard deviations: errors that its points share, such as those of the
     # calibration.

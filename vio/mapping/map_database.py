@@ -23,6 +23,7 @@ import numpy as np
 
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity
 
 VERSION = 5
 _OLDEST = 1
@@ -52,9 +53,9 @@ _ROTATION_TOLERANCE = 1e-3  # of R R^T
 class _StepLimits(NamedTuple):
     """How long one step with the file may take."""
 
-    max_s: float = 300.0  # of one step with the file
+    max_s: Capacity[float] = 300.0  # of one step with the file
     # instructions of SQLite between two looks at the clock, and at signals
-    instructions_per_look: int = 10_000
+    instructions_per_look: Capacity[int] = 10_000
 
 
 _LIMITS = _StepLimits()

@@ -23,6 +23,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.upright import mean_up, nearest_yaw, rotation_to_up
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.pose_graph import Edges, UpDirections, marginals, optimise
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.records import BoolArray, IntArray
 
 # What the odometry may be off by beyond its own covariance, since errors of the calibration add up
@@ -38,14 +39,18 @@ class _GraphRules:
     # of the search for them, in mean variances of a motion; and from try to try
     first_reach: float = 30.0
     further: float = 2.0
-    max_exact: int = 200  # keyframes whose covariance is computed, beside the first of each session
-    min_variance_m2: float = 1e-8  # of a keyframe's position since its session began
+    max_exact: Capacity[int] = (
+        200  # keyframes whose covariance is computed, beside the first of each session
+    )
+    min_variance_m2: Tolerance[float] = 1e-8  # of a keyframe's position since its session began
 
 
 _GRAPH = _GraphRules()
-_WINDOW = 1000  # keyframes that are optimised for a new loop, beside those of its cycle
+_WINDOW: Capacity[int] = (
+    1000  # keyframes that are optimised for a new loop, beside those of its cycle
+)
 # variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
-UNKNOWN = 1e6
+UNKNOWN: Tolerance[float] = 1e6
 
 
 class Rows:

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from vio.geometry.lie import FloatArray
 from vio.mapping.features import DESCRIPTOR_BYTES, Bits
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Capacity
 from vio.records import BoolArray, IntArray
 
 Words = npt.NDArray[np.uint16]
@@ -51,7 +52,7 @@ class _TailRules(NamedTuple):
 
 _TAIL = _TailRules()
 _UNIT = 1 << 16  # of the weights
-SEGMENT = 256  # keyframes whose words a file keeps in the order of the index
+SEGMENT: Capacity[int] = 256  # keyframes whose words a file keeps in the order of the index
 
 
 def words_of(descriptors: Bits) -> Words:

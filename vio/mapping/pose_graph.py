@@ -26,6 +26,7 @@ from vio.geometry.lie import (
 )
 from vio.geometry.relative_pose import RelativePose
 from vio.numerics import sparse
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import CUT_OFF_PROBABILITY, MU_GROWTH, truncated_weights
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
@@ -35,9 +36,9 @@ from vio.records import BoolArray, IntArray
 class _GncRules:
     """Graduated non-convexity."""
 
-    max_steps: int = 15
-    max_gnc_steps: int = 30
-    converged: float = 1e-6  # largest change, m and rad
+    max_steps: Tolerance[int] = 15
+    max_gnc_steps: Tolerance[int] = 30
+    converged: Tolerance[float] = 1e-6  # largest change, m and rad
 
 
 _GNC = _GncRules()

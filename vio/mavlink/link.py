@@ -7,10 +7,11 @@ import socket
 from typing import Any, Protocol
 
 from vio.errors import ConfigError, DataError, MissingDependencyError, extra_text
+from vio.numerics.kinds import Capacity
 
 _BAUD = 921_600
-_MAX_BYTES = 4096
-_WAIT_S = 0.1
+_MAX_BYTES: Capacity[int] = 4096
+_WAIT_S: Capacity[float] = 0.1
 _FORMS = "give udp:HOST:PORT, or serial:DEVICE[:BAUD]"
 MISSING = "--mavlink needs pymavlink, over a serial line also pyserial; " + extra_text("mavlink")
 

@@ -13,6 +13,7 @@ from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, se3_exp, so3_exp
 from vio.monitor.gyro_fit import AGREES, GyroFit
 from vio.monitor.motion import Record
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import jackknife
 from vio.records import BoolArray
 
@@ -29,7 +30,7 @@ class _FitPriors(NamedTuple):
     bias_mps2: float = 0.3
     lever_arm_m: float = 1.0
     misfit_m: float = 0.02  # standard deviation of a window's positions, to weight the priors
-    reweightings: int = 4
+    reweightings: Tolerance[int] = 4
 
 
 _PRIORS = _FitPriors()

@@ -14,10 +14,11 @@ from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.monitor.samples import GAP_S, MEMORY_S
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.numerics.robust import median
 from vio.records import S_PER_NS, BoolArray, IntArray, Observations, feature_tracks, shared_rows
 
-BATCH = 20  # frames whose motion is computed at once
+BATCH: Capacity[int] = 20  # frames whose motion is computed at once
 
 
 class _TwistRules(NamedTuple):
@@ -26,7 +27,7 @@ class _TwistRules(NamedTuple):
     tracks_per_frame: int = 80  # tracks of a frame that the camera's motion is computed from
     min_links: int = 15  # tracks between two frames
     max_interval_s: float = 0.25
-    same_s: float = 1e-6  # intervals whose end and start differ by less are contiguous
+    same_s: Tolerance[float] = 1e-6  # intervals whose end and start differ by less are contiguous
 
 
 _TWISTS = _TwistRules()

@@ -11,9 +11,10 @@ from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import InertialFinding
 from vio.monitor.gyro_fit import AGREES, GyroFit
 from vio.monitor.motion import Record
+from vio.numerics.kinds import Tolerance
 from vio.records import ROTATION_NOT_COMPARABLE, RotationComparison
 
-_BLOCKS = 10  # of the record, for the jackknife
+_BLOCKS: Tolerance[int] = 10  # of the record, for the jackknife
 _IMAGE = [0, 1]  # the camera's axes
 _OPTICAL = [2]
 

@@ -21,9 +21,12 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from vio.dataclass import dataclass
+from vio.numerics.kinds import Tolerance
 
 State = TypeVar("State")
-_LARGER = 10.0  # after a step that raises the cost, and smaller by as much after one that does not
+_LARGER: Tolerance[float] = (
+    10.0  # after a step that raises the cost, and smaller by as much after one that does not
+)
 
 
 @dataclass(slots=True)

@@ -12,9 +12,10 @@ from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
 from vio.numerics.arrays import FloatArray
+from vio.numerics.kinds import Capacity
 
-_LARGE = 10_000  # unknowns
-_AT_ONCE = 32  # blocks: right-hand sides are dense
+_LARGE: Capacity[int] = 10_000  # unknowns
+_AT_ONCE: Capacity[int] = 32  # blocks: right-hand sides are dense
 
 
 def factors(H: csc_matrix, block: int = 1) -> Callable[[FloatArray], FloatArray]:

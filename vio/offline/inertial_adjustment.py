@@ -35,6 +35,7 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, so3_
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
 from vio.numerics import sparse
+from vio.numerics.kinds import Tolerance
 from vio.numerics.least_squares import Damping
 from vio.offline.points import MIN_DEPTH_M, PointTracks
 from vio.records import FIELD_TERMS, ROW_TERMS, IntArray
@@ -51,14 +52,14 @@ class _AdjustmentRules:
     settled_steps: int = 7  # steps after which neither width nor preintegration change
     # of the cost, from step to step: what goes on is rows that turn into outliers, and moves no
     # pose
-    converged_share: float = 1e-4
-    max_steps: int = 25
-    first_damping: float = 1e-6
-    max_damping: float = 1e3
+    converged_share: Tolerance[float] = 1e-4
+    max_steps: Tolerance[int] = 25
+    first_damping: Tolerance[float] = 1e-6
+    max_damping: Tolerance[float] = 1e3
     # tracks that end within it in one cell of directions share their errors, as in (R7)
     cell_s: float = 1.0
     # inverse standard deviation, 1/m and 1/rad, of position and heading of the first keyframe
-    gauge_weight: float = 1e4
+    gauge_weight: Tolerance[float] = 1e4
 
 
 _ADJUSTMENT = _AdjustmentRules()

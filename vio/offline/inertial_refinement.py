@@ -19,6 +19,7 @@ from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
 from vio.imu.preintegration import BodyStates, Readings
 from vio.imu.settings import ImuSettings
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import robust_sigma
 from vio.offline.inertial_adjustment import InertialAdjustment, Optimum, RigPrior
 from vio.offline.keyframes import TrackedPath, loop_ends
@@ -33,8 +34,8 @@ class _AdjustmentRules(NamedTuple):
     # On the standard deviations of pixels: errors of a track last longer than from keyframe to
     # keyframe. The same as on the motions of a map's odometry, where it was measured.
     lasting_factor: float = 2.0
-    min_sigma_px: float = 1e-3  # of exact pixels, as simulated ones may be
-    tiny: float = 1e-7  # focal lengths: of coefficients that are known
+    min_sigma_px: Tolerance[float] = 1e-3  # of exact pixels, as simulated ones may be
+    tiny: Tolerance[float] = 1e-7  # focal lengths: of coefficients that are known
 
 
 _ADJUSTMENT = _AdjustmentRules()

@@ -10,6 +10,7 @@ import numpy as np
 from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
+from vio.numerics.kinds import Tolerance
 from vio.offline.keyframes import TrackedPath
 from vio.offline.loop_tracks import loop_rows
 from vio.records import BoolArray, IntArray, Landmarks
@@ -18,7 +19,7 @@ from vio.records import BoolArray, IntArray, Landmarks
 class _PointRules(NamedTuple):
     """Which points are triangulated."""
 
-    steps: int = 8
+    steps: Tolerance[int] = 8
     min_views: int = 2  # of a point
 
 

@@ -17,6 +17,7 @@ from vio.files.inputs import read_input
 from vio.files.yaml_text import MAX_BYTES, read_yaml
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import robust_sigma
 from vio.offline.colmap.adjustment import Adjustment, PositionPriors, adjust
 from vio.offline.comparison import aligned_distance_m
@@ -244,10 +245,10 @@ def _estimator_settings(path: Path) -> Config:
 class _PriorRules:
     """Which rows a prior of poses is made of."""
 
-    max_pose_steps: int = 12
+    max_pose_steps: Tolerance[int] = 12
     min_rows: int = 6
     # of a prior: the first pose of a filter has no uncertainty by definition
-    min_sigma_m: float = 1e-4
+    min_sigma_m: Tolerance[float] = 1e-4
 
 
 _PRIOR = _PriorRules()

@@ -24,6 +24,7 @@ from vio.calibration.stereo_field import PARAMETERS
 from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Tolerance
 from vio.numerics.least_squares import Damping
 from vio.numerics.robust import robust_sigma
 from vio.offline.points import MIN_DEPTH_M, PointTracks, keep_rows
@@ -65,19 +66,19 @@ class _RefinementRules:
     # the same drives.
     lens_deg: float = 0.01
     lens_direction_deg: float = 0.3
-    held: float = 1e-9  # standard deviation of what is not free
-    max_steps: int = 30  # of Levenberg-Marquardt
-    min_damping: float = 1e-10
-    max_damping: float = 1e4
-    converged_share: float = 1e-6  # relative change of the cost
+    held: Tolerance[float] = 1e-9  # standard deviation of what is not free
+    max_steps: Tolerance[int] = 30  # of Levenberg-Marquardt
+    min_damping: Tolerance[float] = 1e-10
+    max_damping: Tolerance[float] = 1e4
+    converged_share: Tolerance[float] = 1e-6  # relative change of the cost
     # robust standard deviation above which the tracks are not of one rigid scene and rig
     max_residual_px: float = 1.5
     cauchy_sigmas: float = 2.0  # residuals of so many standard deviations count half
     gate_sigmas: float = 5.0  # rows with larger residuals, in standard deviations, are left out
     # of a point's information, against rounding; more of it passes for knowledge of depths
-    rounding: float = 1e-12
+    rounding: Tolerance[float] = 1e-12
     cells: tuple[int, int] = (8, 4)  # regions of the image, along u and v
-    min_residual_px: float = 0.02  # of exact tracks, so that weights stay finite
+    min_residual_px: Tolerance[float] = 0.02  # of exact tracks, so that weights stay finite
 
 
 _REFINEMENT = _RefinementRules()

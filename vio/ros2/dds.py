@@ -33,6 +33,7 @@ from cyclonedds.util import duration
 
 from vio.datasets.bags.cdr import Field, fields_of
 from vio.errors import DataError
+from vio.numerics.kinds import Capacity
 from vio.ros2.transport import Quality
 
 
@@ -40,9 +41,9 @@ class _QueueLimits(NamedTuple):
     """How many messages wait."""
 
     # messages that wait for `spin`; of a topic that must not lose any, all
-    depth_messages: int = 1000
+    depth_messages: Capacity[int] = 1000
     max_images: int = 50  # that wait where none must be lost: then the sender waits
-    taken_messages: int = 10_000  # at a time
+    taken_messages: Capacity[int] = 10_000  # at a time
     last_s: float = 30.0  # that a receiver may take for the last messages
 
 

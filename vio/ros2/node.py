@@ -17,6 +17,7 @@ from vio.live.build import MapUse
 from vio.live.live_odometry import LiveOdometry
 from vio.live.worker import Drop
 from vio.mavlink.output import MavlinkOutput, MavlinkSettings
+from vio.numerics.kinds import Capacity
 from vio.ros2.calibration import CameraInfos
 from vio.ros2.outputs import RESET, SAVE, FrameNames, Outputs
 from vio.ros2.sensors import SILENT_S, Sensors, SensorTopics, Silence, check_types
@@ -25,7 +26,7 @@ from vio.runs.live_folder import LiveFolder, LiveRunSettings
 
 log = logging.getLogger(__name__)
 
-_SPIN_S = 0.1
+_SPIN_S: Capacity[float] = 0.1
 _EMPTY = "std_msgs/msg/Empty"
 
 

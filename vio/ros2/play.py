@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from vio.datasets.bags.topics import CAMERA_INFO, IMAGE, IMU
 from vio.datasets.bags.writer import BagWriter
 from vio.geometry.lie import se3_inverse
+from vio.numerics.kinds import Capacity
 from vio.protocols import Dataset
 from vio.records import Event, ImuSample, Recording, StereoFrame
 from vio.ros2.calibration import info_topic
@@ -18,7 +19,7 @@ from vio.ros2.transport import Quality, Transport, publisher
 
 CAMERA_FRAMES = ("cam0", "cam1")
 IMU_FRAME = "imu"
-_WAIT_S = 0.05
+_WAIT_S: Capacity[float] = 0.05
 _OTHERS_S = 1.0  # after the first subscriber, for those to other topics
 
 

@@ -19,9 +19,10 @@ from rclpy.signals import SignalHandlerOptions
 from rosidl_runtime_py.utilities import get_message
 
 from vio.errors import DataError
+from vio.numerics.kinds import Capacity
 from vio.ros2.transport import Quality
 
-_DEPTH = 1000  # messages that wait for `spin`, or for a slow subscriber
+_DEPTH: Capacity[int] = 1000  # messages that wait for `spin`, or for a slow subscriber
 
 
 class RclpyTransport:

@@ -26,11 +26,12 @@ from vio._version import __version__
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_bytes
 from vio.files.inputs import read_input
+from vio.numerics.kinds import Capacity
 from vio.protocols import Dataset
 
 _FORMAT = "stereo-vio checkpoint 2"
 _PACKAGE = __name__.split(".", maxsplit=1)[0]
-_MAX_BYTES = 4 << 30
+_MAX_BYTES: Capacity[int] = 4 << 30
 _PLAIN = frozenset((type(None), bool, int, float, str))
 _SEQUENCES = frozenset((list, tuple, set, frozenset))
 # of the classes whose objects are saved, beside this package's own

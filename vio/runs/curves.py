@@ -13,6 +13,7 @@ from vio.evaluation.trajectories import Evaluation
 from vio.files.tables import Rows
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.upright import attitude_deg, rotated, upright_view
+from vio.numerics.kinds import Capacity
 from vio.records import RIGHT_TERMS, Trajectory
 from vio.runs.finished import FinishedRun
 
@@ -30,8 +31,8 @@ FEATURE_WORDS = {
 class _CurveLimits(NamedTuple):
     """How much of a curve is drawn."""
 
-    max_samples: int = 3000  # samples of a curve; more are not seen on a screen
-    max_points: int = 6000
+    max_samples: Capacity[int] = 3000  # samples of a curve; more are not seen on a screen
+    max_points: Capacity[int] = 6000
 
 
 _LIMITS = _CurveLimits()

@@ -22,6 +22,7 @@ from vio.files.tables import Rows
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray
 from vio.geometry.upright import up_of
+from vio.numerics.kinds import Capacity
 from vio.records import LoopEvent, MapKeyframes, Trajectory
 from vio.runs.files import RunFile
 from vio.runs.mapped import read_keyframes, read_lines, read_loops
@@ -33,7 +34,7 @@ log = logging.getLogger(__name__)
 _FORMER = {"watch_ms": "monitor_ms"}  # columns of frames.csv by their names until 0.2
 
 _PLY_POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "sigma")])
-_MAX_PLY_BYTES = 2 << 30
+_MAX_PLY_BYTES: Capacity[int] = 2 << 30
 
 
 @dataclass(frozen=True, slots=True)

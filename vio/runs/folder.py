@@ -34,6 +34,7 @@ from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.numerics import robust
 from vio.numerics.compiled import has_compiled
+from vio.numerics.kinds import Capacity
 from vio.protocols import Dataset
 from vio.records import IMU_ENTRIES, Landmarks, Trajectory
 from vio.runs.files import FILES, REQUEST, RunFile
@@ -58,8 +59,8 @@ _SLOW = 10.0  # times the median; frames that take longer compile, or wait for s
 class _Chunks(NamedTuple):
     """How much is written at a time."""
 
-    rows: int = 100_000  # points and frames at a time
-    frames: int = 5_000
+    rows: Capacity[int] = 100_000  # points and frames at a time
+    frames: Capacity[int] = 5_000
 
 
 _CHUNKS = _Chunks()

@@ -30,6 +30,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.odometry import Odometry
 from vio.monitor.integrity import Mark
+from vio.numerics.kinds import Capacity
 from vio.records import (
     BodyFrame,
     Estimate,
@@ -54,7 +55,7 @@ log = logging.getLogger(__name__)
 
 # Results and samples that wait for the disk, some twenty seconds of them; where a disk stalls for
 # longer, the writing ends, and the odometry goes on.
-_MAX_WAITING = 5000
+_MAX_WAITING: Capacity[int] = 5000
 _LIVE = "live:"  # how the source of a live run begins in what its folder was asked for
 
 

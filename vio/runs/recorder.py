@@ -27,6 +27,7 @@ from vio.files.trajectories import tum_text
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
 from vio.monitor.integrity import Mark, marked
+from vio.numerics.kinds import Capacity
 from vio.protocols import Dataset
 from vio.records import (
     NS_PER_S,
@@ -73,12 +74,12 @@ _TEXTS = (RunFile.TRAJECTORY, RunFile.FRAMES)  # that grow
 class _WriteTimes(NamedTuple):
     """When files are written."""
 
-    flush_s: float = 1.0
+    flush_s: Capacity[float] = 1.0
     checkpoint_s: float = 5.0
 
 
 _TIMES = _WriteTimes()
-_CHUNK = 100_000  # points at a time
+_CHUNK: Capacity[int] = 100_000  # points at a time
 _POSE = np.dtype([("T", "<f8", (4, 4))])
 _TABLES = {
     "estimates": ESTIMATE,

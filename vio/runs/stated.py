@@ -30,12 +30,13 @@ from vio.files.schema import (
 )
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, checked_transform
+from vio.numerics.kinds import Capacity
 from vio.records import Trajectory
 from vio.runs.files import RunFile
 
 log = logging.getLogger(__name__)
 
-_MAX_BYTES = 2**26
+_MAX_BYTES: Capacity[int] = 2**26
 _NUMBERS = a_list(NUMBER)
 
 REQUEST_SHAPE = an_object(

@@ -17,11 +17,14 @@ import numpy.typing as npt
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, triangulate, z_D_p_cam
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.records import BoolArray, IntArray, MotionPrior, Observations
 
-_BATCH = 6  # candidates evaluated exactly at first; doubled until the best is certain
+_BATCH: Capacity[int] = (
+    6  # candidates evaluated exactly at first; doubled until the best is certain
+)
 _EYE = np.eye(3)
-_TIE = 1e-10  # relative difference below which two gains are the same
+_TIE: Tolerance[float] = 1e-10  # relative difference below which two gains are the same
 
 
 def motion_rows(camera: StereoCamera, p_cam: FloatArray) -> FloatArray:

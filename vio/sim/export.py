@@ -28,6 +28,7 @@ from vio.files.atomic import atomic_folder
 from vio.files.text import exact_text, seconds_text, write_text
 from vio.files.trajectories import in_first_cam0, write_tum
 from vio.geometry.lie import FloatArray, se3_inverse
+from vio.numerics.kinds import Capacity
 from vio.protocols import Progress
 from vio.records import ImuDensities
 from vio.sim.imu import ADIS16448, sample_times
@@ -36,7 +37,7 @@ from vio.sim.sequence import SimulatedRecording, true_biases
 
 MARKER = "simulation.json"
 _TRUTH_HZ = 200.0
-_PENDING = 8  # images waiting to be written
+_PENDING: Capacity[int] = 8  # images waiting to be written
 
 
 def export_euroc(

@@ -24,6 +24,7 @@ from vio.errors import DataError, SimulationError
 from vio.files.text import check_increasing
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log
+from vio.numerics.kinds import Tolerance
 from vio.records import S_PER_NS, BoolArray, IntArray
 
 logger = logging.getLogger(__name__)
@@ -48,14 +49,14 @@ _CAR = _CarMotion()
 class _SmoothingRules:
     """How poses are smoothed to a spline."""
 
-    robust_steps: int = 8
+    robust_steps: Tolerance[int] = 8
     outlier_sigmas: float = 5.0
     outlier_floor: tuple[float, float] = (
         0.002,
         0.01,
     )  # m, rad: smaller residuals are smoothing, not outliers
-    rotation_steps: int = 12
-    rotation_tolerance_rad: float = 1e-10
+    rotation_steps: Tolerance[int] = 12
+    rotation_tolerance_rad: Tolerance[float] = 1e-10
 
 
 _SMOOTHING = _SmoothingRules()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
+from vio.numerics.kinds import Capacity
 from vio.records import NS_PER_S, IntArray
 from vio.sim.motion import MotionSpline, motion_at
 from vio.sim.world import MovingBox, ObjectMotion, Solid, World
@@ -26,8 +27,8 @@ class _PeopleRules:
     radius_m: float = 0.3  # of the space that a person takes
     height_m: float = 1.8
     spacing_ns: int = 50_000_000  # between the times at which camera and person are kept apart
-    coarse: int = 20  # of these times one is tried first
-    attempts: int = 300  # for each person
+    coarse: Capacity[int] = 20  # of these times one is tried first
+    attempts: Capacity[int] = 300  # for each person
     keep_clear_m: float = 0.3  # height of the points on a way that keep furniture off
 
 

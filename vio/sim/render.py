@@ -22,6 +22,7 @@ import numpy.typing as npt
 from vio.errors import SimulationError
 from vio.geometry.distortion import CameraModel, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.records import BoolArray, IntArray
 from vio.sim.textures import LEVELS_PER_OCTAVE, MipTexture
 from vio.sim.world import Surfaces, World, surfaces_at
@@ -32,12 +33,14 @@ Radiance: TypeAlias = npt.NDArray[np.float32]
 class _RenderRules(NamedTuple):
     """Accuracy and memory of the rays."""
 
-    tile_px: int = 64  # pixels
-    coarse_tiles: int = 2  # tiles along a coarse tile
+    tile_px: Capacity[int] = 64  # pixels
+    coarse_tiles: Capacity[int] = 2  # tiles along a coarse tile
     detail_step_px: int = 4  # pixels between evaluations of the level of detail
-    min_front_m: float = 1e-6
-    same_point_share: float = 1e-6  # relative distance within which two hits are the same point
-    max_pairs: int = 400_000  # rays times surfaces held in memory at once
+    min_front_m: Tolerance[float] = 1e-6
+    same_point_share: Tolerance[float] = (
+        1e-6  # relative distance within which two hits are the same point
+    )
+    max_pairs: Capacity[int] = 400_000  # rays times surfaces held in memory at once
     # ratio of footprint sides from which the longer one gets twice the samples
     stretched_ratio: float = 2.0
 

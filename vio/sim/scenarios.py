@@ -21,6 +21,7 @@ import numpy as np
 from vio.errors import DataError, SimulationError
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts
+from vio.numerics.kinds import Capacity
 from vio.numerics.threads import start_worker
 from vio.protocols import Progress
 from vio.records import NS_PER_S, Image, ImuRecord, IntArray
@@ -85,7 +86,7 @@ class _Scene(NamedTuple):
 
 
 _SCENE = _Scene()
-_AHEAD = 3  # pending frames per process
+_AHEAD: Capacity[int] = 3  # pending frames per process
 
 FLIGHT_FILES = ("groundtruth_tum.txt", "image_timestamps_ns.txt", "imu0.csv")
 

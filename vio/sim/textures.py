@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from vio.errors import SimulationError
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 
 TextureKind: TypeAlias = Literal[
@@ -30,7 +31,7 @@ class _TextureRules(NamedTuple):
 
     # texels of repeated border around each level, for the interpolation kernel
     gutter_texels: int = 3
-    max_side_texels: int = 32000  # cv2.remap addresses its source with 16-bit integers
+    max_side_texels: Capacity[int] = 32000  # cv2.remap addresses its source with 16-bit integers
     min_level_texels: int = 4
     max_marks: int = 6000  # of one kind on one surface
     coarse_texels: int = 16  # of the shorter side of the copy that exposure is metered on

@@ -17,6 +17,7 @@ from vio.cameras.rig import Rig, camera_from_matrix
 from vio.errors import DataError, MissingDependencyError, extra_text
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.live.pairing import Pairing
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
 
@@ -40,7 +41,7 @@ _FISHEYE_COEFFICIENTS = 4
 class _Waits(NamedTuple):
     """How long a camera is waited for."""
 
-    pause_s: float = 0.002
+    pause_s: Capacity[float] = 0.002
     lost_s: float = 5.0
 
 

@@ -20,6 +20,7 @@ from vio.cameras.rig import Rig, camera_from_matrix
 from vio.errors import DataError, MissingDependencyError, extra_text
 from vio.geometry.lie import FloatArray, se3_from_parts
 from vio.live.pairing import Pairing
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
 
@@ -38,7 +39,7 @@ class _Streams:
 
 _STREAMS = _Streams()
 _LOST_S = 5.0
-_WAITING = 1000  # frames and samples that may wait for the reader
+_WAITING: Capacity[int] = 1000  # frames and samples that may wait for the reader
 
 # The distortion of the infrared images, which the device rectifies; of raw ones, OpenCV's.
 # `inverse_brown_conrady` distorts as `brown_conrady` does, whatever its name says, but for second

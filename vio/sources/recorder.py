@@ -20,11 +20,12 @@ from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
 from vio.files.text import exact_text, seconds_text
+from vio.numerics.kinds import Capacity
 from vio.sources.source import SourceEvent, SourceFrame
 
 Form: TypeAlias = Literal["plain", "rosbag2", "mcap"]
 
-_WAITING = 100  # frames that may wait for the disk; beyond, the source waits
+_WAITING: Capacity[int] = 100  # frames that may wait for the disk; beyond, the source waits
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # fast
 _CAMERAS = ("cam0", "cam1")
 IMU_HEADER = "timestamp [ns],wx,wy,wz,ax,ay,az\n"

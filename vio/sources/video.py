@@ -11,11 +11,12 @@ import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.errors import DataError
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 from vio.sources.source import Layout, SourceEvent, SourceFrame
 
 _MAX_FAILED = 50  # reads in a row without an image, after which a device has gone
-_PAUSE_S = 0.02  # between them
+_PAUSE_S: Capacity[float] = 0.02  # between them
 
 
 class VideoSource:

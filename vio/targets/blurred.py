@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.numerics.robust import median
 from vio.records import Image, IntArray
 from vio.targets.description import Target
@@ -26,13 +27,13 @@ class _PrintRules(NamedTuple):
     """How the blurred print is drawn."""
 
     module_texels: int = 8  # a module
-    max_texture_px: int = 4096
+    max_texture_px: Capacity[int] = 4096
     # of a tag or square: paper around the print, which is known to be light
     margin_share: float = 0.1
     finer_samples: int = 2  # samples along a side of a pixel, where blur is below
     fine_below_px: float = 1.8
     apron_sigmas: float = 3.0
-    corners_at_once: int = 64  # corners that are drawn in one image
+    corners_at_once: Capacity[int] = 64  # corners that are drawn in one image
 
 
 _PRINT = _PrintRules()
@@ -46,9 +47,9 @@ class _WindowRules(NamedTuple):
     half_share: float = 0.5  # of a tag's or square's side
     half_sigmas: float = 2.0
     weight_share: float = 0.6  # of the half side: standard deviation of the weights
-    max_steps: int = 12
+    max_steps: Tolerance[int] = 12
     max_step_px: float = 1.5
-    converged_px: float = 1e-3
+    converged_px: Tolerance[float] = 1e-3
     min_known_share: float = 0.3  # of a window's weight
     tried_corners: int = 12
 

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, project_point, uv_D_camera, uv_D_point
 from vio.geometry.lie import FloatArray, se3_exp, so3_hat
+from vio.numerics.kinds import Tolerance
 from vio.numerics.least_squares import Damping
 from vio.numerics.robust import median
 from vio.targets.views import Sightings
@@ -33,9 +34,9 @@ _POSE = 6
 class _Iterations(NamedTuple):
     """When the adjustment ends."""
 
-    max_steps: int = 60
-    converged_share: float = 1e-6  # relative change of the cost
-    max_damping: float = 1e8
+    max_steps: Tolerance[int] = 60
+    converged_share: Tolerance[float] = 1e-6  # relative change of the cost
+    max_damping: Tolerance[float] = 1e8
 
 
 _ITERATIONS = _Iterations()

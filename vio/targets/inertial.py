@@ -27,6 +27,7 @@ from vio.filters.imu_terms import CHOSEN, IMU_TERMS, ImuTerms, calibrated, term_
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.imu.preintegration import BodyStates, Preintegrated, Readings, preintegrate
 from vio.imu.settings import DEFAULT_IMU
+from vio.numerics.kinds import Tolerance
 from vio.numerics.least_squares import Damping
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
@@ -39,12 +40,12 @@ _SHARED = 9  # xi of `T_cam0_imu exp(xi)`, time, two turns of gravity; then the 
 class _Iterations(NamedTuple):
     """Steps of the adjustment."""
 
-    max_steps: int = 20
-    converged_share: float = 1e-5  # relative change of the cost
-    numeric_step: float = 1e-6
-    term_step: float = 1e-4
-    gauge_weight: float = 1e-9
-    max_damping: float = 1e6
+    max_steps: Tolerance[int] = 20
+    converged_share: Tolerance[float] = 1e-5  # relative change of the cost
+    numeric_step: Tolerance[float] = 1e-6
+    term_step: Tolerance[float] = 1e-4
+    gauge_weight: Tolerance[float] = 1e-9
+    max_damping: Tolerance[float] = 1e6
 
 
 _ITERATIONS = _Iterations()

@@ -16,6 +16,7 @@ from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel, project_point, unproject_pixel
 from vio.geometry.lenses.registry import LENSES
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_inverse, se3_log
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import median
 from vio.records import IntArray
 from vio.targets.bundle import Adjusted, BoardAdjustment, RigFit
@@ -30,7 +31,7 @@ class _StartRules(NamedTuple):
 
     adjusted_starts: int = 2  # of them that are adjusted
     views: int = 8
-    steps: int = 12
+    steps: Tolerance[int] = 12
     min_rows: int = 6  # corners of a view that give a pose
 
 

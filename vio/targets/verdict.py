@@ -31,6 +31,7 @@ from vio.geometry.lie import (
     so3_hat,
     transform_points,
 )
+from vio.numerics.kinds import Tolerance
 from vio.numerics.statistics import chi_square_quantile
 from vio.targets.bundle import (
     Adjusted,
@@ -51,7 +52,7 @@ class _CheckRules(NamedTuple):
     """When calibrations disagree."""
 
     compensated_corners: int = 500  # corners by which a motion of the camera is determined
-    step_sigmas: float = 0.1  # of numerical differences
+    step_sigmas: Tolerance[float] = 0.1  # of numerical differences
     # of halves that agree as stated; further apart, they inflate the sigmas
     chance_probability: float = 0.99
     unsynchronised_ratio: float = 1.5  # residual of the pair over that of the cameras alone

@@ -18,6 +18,7 @@ import numpy as np
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays
 from vio.geometry.upright import rotated, upright_view
+from vio.numerics.kinds import Capacity
 from vio.records import (
     BoolArray,
     Estimate,
@@ -50,7 +51,7 @@ class _Picture:
     widest_px: int = 752  # images are shown at this width at most
     jpeg_quality: int = 75
     # poses of a path that are sent together; the last chunk is sent again with every pose
-    chunk: int = 64
+    chunk: Capacity[int] = 64
     tail: int = 12  # positions of a track that are drawn
     min_disparity_px: float = 3.0  # of points drawn from one stereo pair
     sigmas: float = 3.0

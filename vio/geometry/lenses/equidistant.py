@@ -22,9 +22,10 @@ from vio.geometry.lenses.model import (
     plane_by_point,
 )
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 
-_NEWTON_STEPS = 30
-_NEWTON_TOLERANCE = 1e-11  # on the normalised image plane: about 1e-8 px
+_NEWTON_STEPS: Tolerance[int] = 30
+_NEWTON_TOLERANCE: Tolerance[float] = 1e-11  # on the normalised image plane: about 1e-8 px
 
 
 def _polynomial(c: Coefficients, theta: FloatArray) -> tuple[FloatArray, FloatArray]:

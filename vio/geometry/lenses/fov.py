@@ -22,9 +22,12 @@ from vio.geometry.lenses.model import (
     plane_by_point,
 )
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 
-_STRAIGHT = 1e-6  # radians: below, the lens is a pinhole to 1e-13 of the radius
-_MARGIN = 1e-6  # radians about the backward axis, all of which would be one circle of pixels
+_STRAIGHT: Tolerance[float] = 1e-6  # radians: below, the lens is a pinhole to 1e-13 of the radius
+_MARGIN: Tolerance[float] = (
+    1e-6  # radians about the backward axis, all of which would be one circle of pixels
+)
 
 
 def _slopes(w: float) -> tuple[float, float]:

@@ -17,10 +17,11 @@ import numpy.typing as npt
 
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Coefficients: TypeAlias = tuple[float, ...]
-TINY = 1e-12
+TINY: Tolerance[float] = 1e-12
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from vio.geometry.lenses.model import (
@@ -14,8 +16,9 @@ from vio.geometry.lenses.model import (
     plane_by_point,
 )
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity, Tolerance
 
-_MIN_DEPTH = 1e-9
+_MIN_DEPTH: Tolerance[float] = 1e-9
 
 
 def pinhole(p: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -52,7 +55,7 @@ class Pinhole(Lens):
         colmap={0: ("PINHOLE", 0)},
     )
     planar = True
-    linear_tiles = 4
+    linear_tiles: ClassVar[Capacity[int]] = 4
 
     def project(self, c: Coefficients, p: FloatArray) -> tuple[FloatArray, BoolArray]:
         return pinhole(p)

@@ -7,6 +7,7 @@ References: Brown, Close-range camera calibration (1971), as OpenCV, EuRoC and K
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,12 +23,13 @@ from vio.geometry.lenses.model import (
 from vio.geometry.lenses.pinhole import pinhole, pinhole_by_point
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Capacity, Tolerance
 
-_NEWTON_STEPS = 30
-_NEWTON_TOLERANCE = 1e-11  # on the normalised image plane: about 1e-8 px
+_NEWTON_STEPS: Tolerance[int] = 30
+_NEWTON_TOLERANCE: Tolerance[float] = 1e-11  # on the normalised image plane: about 1e-8 px
 _MAX_NEWTON_STEP = 0.5  # on the normalised image plane
-_MIN_DETERMINANT = 1e-6
-_SAME_POINT = 1e-8  # on the normalised image plane
+_MIN_DETERMINANT: Tolerance[float] = 1e-6
+_SAME_POINT: Tolerance[float] = 1e-8  # on the normalised image plane
 
 
 def _five(c: Coefficients) -> tuple[float, float, float, float, float]:
@@ -255,7 +257,7 @@ class RadialTangential(Lens):
     )
     choices = (Choice("radtan", 4, 1), Choice("radtan5", 5, 6), Choice("rational", 8, 8))
     planar = True
-    linear_tiles = 2
+    linear_tiles: ClassVar[Capacity[int]] = 2
     zero_is_pinhole = True
 
     def project(self, c: Coefficients, p: FloatArray) -> tuple[FloatArray, BoolArray]:

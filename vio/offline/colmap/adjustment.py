@@ -11,6 +11,7 @@ import pycolmap
 from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import robust_sigma
 from vio.offline.colmap.model import (
     LEFT,
@@ -24,7 +25,7 @@ from vio.offline.colmap.model import (
 from vio.offline.points import PointTracks, keep_rows, reprojection
 from vio.records import BoolArray
 
-_MIN_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
+_MIN_SIGMA_PX: Tolerance[float] = 1e-3  # of exact pixels, as simulated ones may be
 # robust standard deviations beyond which rows are excluded from the second round
 _GATE_SIGMAS = 5.0
 
