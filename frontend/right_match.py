@@ -19,7 +19,7 @@ from vio.frontend.stereo_match import ROW_SEARCH, shifted_rows
 from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, IntArray, SigmaArray, TrackPrior
+from vio.records import BoolArray, Image, IntArray, SigmaArray, TrackPrior
 
 _NEARLY_ALL = 0.9  # of the matches without an offset, that one with it may have
 # tried row differences, pixels at half resolution
@@ -169,7 +169,8 @@ class RightMatcher:
         before, or the next one.
 
         A camera that has turned shows all rows off by the same from then on: what the rows of the
-        first such frame were off by counts for the next ones as well.
+        first such frame were off by counts for the next ones as well. Its disparities may be
+        negative, so that those of another pairing, moved by the rig's motion, match instead.
         """
         assert previous.right_half is not None
         before = previous.tracks.left[_rows_by_slot(previous.tracks, tracks)][:_PAIRING_POINTS]
@@ -177,7 +178,7 @@ class RightMatcher:
         first = self._rows_off is None
         offsets = _ROW_OFFSETS if self._rows_off is None else {0, self._rows_off}
         same = {
-            rows: stereo.count_on_rows(left.half, shifted_rows(right.half, rows), now)
+            rows: _count_either_sign(stereo, left.half, shifted_rows(right.half, rows), now)
             for rows in offsets
         }
         if first:
@@ -217,6 +218,18 @@ class RightMatcher:
         then = stereo.match_near(then, right, rows[unique], disparity[unique])
         stereo.update_rows(then)
         return at_present(self._camera, tracks, then, T, delay)
+
+
+def _count_either_sign(
+    stereo: StereoFit, left_half: Image, right_half: Image, points: FloatArray
+) -> int:
+    """Count the left pixels (N, 2) that match on their row, with the sign of disparities that more
+    have.
+    """
+    positive = stereo.count_on_rows(left_half, right_half, points)
+    mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (left_half, right_half)]
+    flipped = points * [-1.0, 1.0] + [2.0 * (left_half.shape[1] - 1), 0.0]
+    return max(positive, stereo.count_on_rows(mirrored[0], mirrored[1], flipped))
 
 
 def _rows_by_slot(old: Tracks, now: Tracks) -> IntArray:

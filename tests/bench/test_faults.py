@@ -94,6 +94,15 @@ def test_every_variant_gives_valid_events_of_its_recording(group: str, name: str
         assert not _equal(events, again)
 
 
+@pytest.mark.parametrize(("group", "name"), [("healthy", "every 2nd"), ("cameras", "no frames")])
+def test_a_part_of_a_variant_with_fewer_frames_has_all_of_its_frames(group: str, name: str) -> None:
+    """Recordings of which a part is run lacked half of it every second frame."""
+    changed = GROUPS[group][name](_Flight(), PERIOD)
+    stop = len(changed.recording.frame_times_ns) - 1
+    found = [e.index for e in changed.events(1, stop) if isinstance(e, StereoFrame)]
+    assert found == list(range(1, stop))
+
+
 def _equal(a: list[Event], b: list[Event]) -> bool:
     if [type(x) for x in a] != [type(x) for x in b] or [x.time_ns for x in a] != [
         x.time_ns for x in b

@@ -179,18 +179,37 @@ def test_what_an_imu_says_of_a_wrong_baseline_is_in_the_covariance() -> None:
         assert low <= share <= high
 
 
-def test_what_the_sensors_noise_explains_is_no_doubt() -> None:
-    """A second of slow motion: its information is that of the accelerometer's noise."""
-    test = measured(0.6, 1 / 6)
-    assert test.doubt() > 0.05
-    for _ in range(40):
+def after(frames: int, information: float, vector: float) -> ScaleTest:
+    """A test after some frames, with what their measurements add up to."""
+    test = measured(vector / information, information**-0.5)
+    for _ in range(frames):
         test.end_frame()
-    assert test.doubt() == 0.0
+    return test
 
 
-def test_noise_passes_for_a_larger_scale_only() -> None:
-    test = measured(-0.6, 1 / 6)
-    before = test.doubt()
-    for _ in range(40):
-        test.end_frame()
-    assert test.doubt() == before > 0.05
+def test_what_the_sensors_noise_explains_is_hardly_any_doubt() -> None:
+    """A second of slow motion: its information may be that of the accelerometer's noise."""
+    assert after(0, 36.0, 21.6).doubt() > 0.05
+    assert after(40, 36.0, 21.6).doubt() < 0.03
+    assert after(1000, 100.0, 90.0).doubt() < 0.03  # standstill
+
+
+def test_the_share_of_noise_in_what_was_measured_is_not_known() -> None:
+    """By sampling: calibrations and shares are drawn, and those kept that show what was measured."""
+    frames, information, vector = 97, 2091.0, -59.0  # a flight of a baseline 10 % too long
+    rng = np.random.default_rng(5)
+    draws = 2_000_000
+    is_wrong = rng.random(draws) < 0.25
+    scale = rng.normal(0.0, np.where(is_wrong, 0.1, 0.02))
+    by_noise = frames * rng.uniform(0.1, 1.0, draws)
+    by_motion = information - by_noise
+    shown = by_noise + by_motion * scale + np.sqrt(by_motion) * rng.normal(size=draws)
+    kept = np.abs(shown - vector) < 4.0
+    mean = (vector - by_noise[kept & is_wrong]) / (by_motion[kept & is_wrong] + 100.0)
+    expected = np.sqrt(is_wrong[kept].mean() * (mean**2).mean())
+    assert after(frames, information, vector).doubt() == pytest.approx(expected, rel=0.1)
+
+
+def test_noise_may_hide_that_the_scale_is_smaller() -> None:
+    """Noise passes for a larger scale only: it makes up for a part of one that is smaller."""
+    assert after(97, 2091.0, -59.0).doubt() > 2.0 * after(0, 2091.0, -59.0).doubt()

@@ -306,3 +306,52 @@ def test_late_pairs_of_a_turned_camera_are_put_right_together() -> None:
 def test_nothing_to_put_right_changes_nothing() -> None:
     given = list(frames())
     assert list(repaired(given, AS_READ, CAMERA)) == given
+
+
+def _turning(begin: int, end: int, count: int = 36) -> list[StereoFrame]:
+    """Frames of a right camera that is turned in some of them."""
+    H = turned_pixels(CAMERA, np.radians(1.2) * np.array(TURNED))
+    found = []
+    for k, pose in enumerate(flight(count)):
+        frame = stereo_frame(k, pose)
+        is_turned = begin <= k < end
+        found.append(replace(frame, right=_warped(frame.right, H)) if is_turned else frame)
+    return found
+
+
+@pytest.mark.parametrize("name", ["klt", "orb"])
+def test_a_camera_that_turns_during_a_run_is_turned_back_once_it_contradicts(name: str) -> None:
+    frontend = guarded(build_frontend(name, CAMERA, SETTINGS), CAMERA)
+    outputs = [frontend.process(frame) for frame in _turning(8, 36)]
+    assert codes(outputs) == [
+        "right-contradicts-left",
+        "right-camera-turned",
+        "-right-contradicts-left",
+    ]
+    finding = next(f for output in outputs for f in output.findings if "turned" in f.code)
+    assert finding.first_frame in (8, 9)
+    np.testing.assert_allclose(angles_deg(finding), 1.2 * np.array(TURNED), atol=0.06)
+    assert AS_READ.adding(finding) == AS_READ  # it was in order before
+    assert outputs[-1].observations.has_right.mean() > 0.7
+
+
+def test_a_camera_that_turns_to_and_fro_is_used_as_given_again() -> None:
+    frontend = guarded(build_frontend("klt", CAMERA, SETTINGS), CAMERA)
+    outputs = [frontend.process(frame) for frame in _turning(8, 24)]
+    assert codes(outputs).count("-right-contradicts-left") == 2
+    assert frontend.turned_back is None
+    assert outputs[-1].observations.has_right.mean() > 0.7
+
+
+def test_images_that_are_turned_back_to_no_avail_are_used_as_given() -> None:
+    check = TurnedPair(CAMERA, RowProbe())
+    check.take([Finding("right-contradicts-left", "", 5, 3, lasts=True)])
+    check.rotation = np.array([0.01, 0.0, 0.0])
+    given = images_of(frames()[0], pair=True)
+    assert given is not None
+    for k in range(21):
+        assert check.rotation is not None, k
+        check._looks_at = None
+        check.inspect(given)
+    assert check.rotation is None
+    assert check.inspect(given).raw[1] is given.raw[1]

@@ -17,7 +17,16 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.protocols import Dataset
-from vio.records import BoolArray, Event, Image, ImuSample, Observations, Recording, StereoFrame
+from vio.records import (
+    BoolArray,
+    Event,
+    Image,
+    ImuSample,
+    IntArray,
+    Observations,
+    Recording,
+    StereoFrame,
+)
 
 Pair: TypeAlias = tuple[Image, Image]
 PairChange: TypeAlias = Callable[[StereoFrame, Image, Image], Pair]
@@ -32,11 +41,15 @@ class Changed:
     source: Dataset
     recording: Recording
     change: EventChange
+    kept: IntArray | None = None  # (F,) the source's frames; None: all
 
     def events(
         self, start: int = 0, stop: int | None = None, *, images: bool = True
     ) -> Iterator[Event]:
         """Yield the changed events of some frames."""
+        if self.kept is not None:
+            start = int(self.kept[start])
+            stop = None if stop is None else int(self.kept[stop - 1]) + 1
         return self.change(self.source.events(start, stop, images=images))
 
     def observations(self, index: int) -> Observations | None:
@@ -75,7 +88,9 @@ def with_frames(dataset: Dataset, kept: BoolArray, change: EventChange = iter) -
             elif kept[event.index]:
                 yield replace(event, index=int(number[event.index]))
 
-    return with_events(dataset, changed, frame_times_ns=dataset.recording.frame_times_ns[kept])
+    recording = dataset.recording
+    times_ns = recording.frame_times_ns[kept]
+    return Changed(dataset, replace(recording, frame_times_ns=times_ns), changed, kept.nonzero()[0])
 
 
 def with_pairs(change: PairChange) -> EventChange:

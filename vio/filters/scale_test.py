@@ -46,6 +46,11 @@ _USUAL_SIGMA = 0.5 * _SCALE.min_log
 # Weight of a wrong calibration before anything was measured. What it adds is small where the sensor
 # agrees, whatever the weight.
 _WRONG_SHARE = 0.25
+_WEIGHTS = np.array([1.0 - _WRONG_SHARE, _WRONG_SHARE])  # of a right and a wrong calibration
+_VARIANCES = np.array([_USUAL_SIGMA, _SCALE.log_sigma]) ** 2  # likewise, of the logarithm
+# of the information that is allowed for noise: from that at standstill on, all are as likely
+_NOISE_SHARES = np.linspace(0.1, 1.0, 10)
+_MAX_BY_NOISE = 0.99  # of what was measured: all of it would leave nothing to judge by
 
 
 def is_clear(velocity: FloatArray, covariance: FloatArray) -> bool:
@@ -118,21 +123,24 @@ class ScaleTest:
         """By what the scale may be off beside what is reported, as a standard deviation over it.
 
         The calibration is right, or it is not and the scale is anywhere: a mixture of two normal
-        distributions, whose weights follow from what was measured by Bayes' rule, less what the
-        sensor's noise explains. Without a measurement it is zero: then the calibration counts.
+        distributions, whose weights follow from what was measured by Bayes' rule. So does the share
+        of it that is the sensor's noise, which is not known: a scale that noise may explain, or
+        hide, is not refused. Without a measurement it is zero: then the calibration counts.
         """
         measured = self._information - _SCALE.log_sigma**-2
         if measured <= 0.0:
             return 0.0
-        # noise passes for a larger scale only
-        by_noise = _SCALE.information_by_noise * self._frames if self._vector > 0.0 else 0.0
-        log = max(abs(self._vector) - by_noise, 0.0) / measured
-        variances = np.array([_USUAL_SIGMA, _SCALE.log_sigma]) ** 2 + 1.0 / measured
-        squared = log**2 / variances
-        likelihood = np.exp(-0.5 * (squared - squared[1]))  # over that of a wrong calibration
-        weights = likelihood / np.sqrt(variances) * [1.0 - _WRONG_SHARE, _WRONG_SHARE]
-        wrong = float(weights[1] / weights.sum())
-        return float(np.sqrt(wrong)) * log * measured / self._information
+        # what noise adds to information and vector alike
+        by_noise = _NOISE_SHARES * min(
+            _SCALE.information_by_noise * self._frames, _MAX_BY_NOISE * measured
+        )
+        information = measured - by_noise
+        vector = self._vector - by_noise
+        variances = _VARIANCES[:, None] + 1.0 / information
+        likelihoods = -0.5 * ((vector / information) ** 2 / variances + np.log(variances))
+        weights = _WEIGHTS[:, None] * np.exp(likelihoods - likelihoods.max())
+        logs = vector / (information + _SCALE.log_sigma**-2)  # of a wrong calibration
+        return float(np.sqrt(weights[1] @ logs**2 / weights.sum()))
 
     @property
     def _contradicted(self) -> bool:

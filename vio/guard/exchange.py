@@ -5,7 +5,7 @@ Each image is compared with both of the last frame. The camera's motion shifts b
 they differ from their own last images by about the same; from the other camera's last image, one
 differs by motion plus disparity and the other by motion minus disparity. Where it is the other way
 round, matches decide: exchanged images match with negative disparities only. So do those of a right
-camera that has turned, but its left image is like the last one of the left camera.
+camera that has turned, but near points still have the larger ones (`vio.guard.depth_order`).
 """
 
 from __future__ import annotations
@@ -41,12 +41,6 @@ class _ExchangeRules:
     # share of them above which a frame that looks exchanged is refused: its rows do not fit when
     # put back
     refused_share: float = 0.2
-    # A left image is the left camera's if its change since that one's last image is less than a
-    # share of that since the right one's, and this more than motion explains: so many times what
-    # the images of the pair before have changed by. None of 900 exchanged pairs, of slow and fast
-    # motion, is so.
-    own_share: float = 0.8
-    motion: float = 1.4
 
 
 _EXCHANGE = _ExchangeRules()
@@ -93,9 +87,9 @@ class ExchangeDetector(ImageCheck):
         self._probe = probe
         # left and right, sparsely sampled, in their right order
         self._last: tuple[Image, Image] | None = None
-        self._usual_change = 0.0  # of the last two images since those before
+        self._last_halves: tuple[Image, Image] | None = None  # likewise, at half resolution
         self._since: int | None = None  # first frame of a run of exchanged ones
-        # disparities are negative, and were so in a frame whose left image was the left camera's
+        # disparities are negative, and were so after a pair in order whose depths they agree with
         self._right_turned = False
         # the matches of the last frame contradicted each other, so matches are counted in any case
         self.suspicious = False
@@ -161,27 +155,25 @@ class ExchangeDetector(ImageCheck):
         ):
             order = _judge(count(), "given" if self._since is None else "exchanged")
             self._right_turned = order != "given" and (
-                self._right_turned or self._left_is_left(changes)
+                self._right_turned or self._depths_agree(left, right)
             )
             if self._right_turned:
                 order = "given"
         if order != "refused":
             self._last = now if order == "given" else now[::-1]
-            if changes is not None:
-                # that of the other image is larger where its camera has turned
-                self._usual_change = min(changes.own if order == "given" else changes.other)
+            self._last_halves = (left, right) if order == "given" else (right, left)
         self._report(index, order)
         return order
 
-    def _left_is_left(self, changes: _Changes | None) -> bool:
-        """Whether the left image is clearly the next one of the left camera, after one in order:
-        then disparities are negative as the right camera has turned.
+    def _depths_agree(self, left: Image, right: Image) -> bool:
+        """Whether the depths of a pair are those of the pair before, which was in order: then
+        disparities are negative as the right camera has turned.
         """
-        if changes is None or self._since is not None:
+        if self._last_halves is None or self._since is not None:
             return False
-        own = changes.own[0]
-        other = changes.other[0]
-        return own < _EXCHANGE.own_share * other and other > _EXCHANGE.motion * self._usual_change
+        from vio.guard.depth_order import keeps_depth_order  # it loads descriptors
+
+        return keeps_depth_order(self._last_halves, (left, right))
 
     def _report(self, index: int, order: Order) -> None:
         if order == "given":

@@ -101,7 +101,10 @@ class GuardedFrontend:
         if self._turned is not None and images.right_usable:
             self._turned.see(output.observations)
         found = tuple(f for check in self._checks for f in check.take_findings())
-        return self._checked(output, found, prior, right_usable=images.right_usable)
+        output = self._checked(output, found, prior, right_usable=images.right_usable)
+        if self._turned is not None and output.findings:
+            self._turned.take(output.findings)
+        return output
 
     def _checked(
         self,

@@ -1,5 +1,4 @@
-"""A right camera that is turned against its calibration from the start, by some tenths of a degree
-and more.
+"""A right camera that is turned against its calibration, by some tenths of a degree and more.
 
 Its rows differ by more than features are searched, or by so much that terms of small angles do not
 hold; turned about y, far points have disparities that are negative. It is suspected where few
@@ -9,10 +8,14 @@ rotation, if they have one (`vio.guard.turned_points`).
 
 From then on right images are turned back. Frames before are left out, as their depths would stay in
 the estimate; where some were used, the rotation is reported and images stay as they are.
+
+So it goes for a camera that turns during a run, of whose right images none is used as they contradict
+the left ones: those that are turned back are used once they agree with the depths from before.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import cv2
@@ -48,11 +51,13 @@ class _TurnedRules(NamedTuple):
     max_yaw_sigma_deg: float = 0.2  # of a yaw by the motion of features
     min_flow_px: float = 2.0  # of features in the mean, between frames that tell it …
     max_still: int = 40  # … and frames with less of it after which none is waited for
+    max_contradicting: int = 20  # frames after which images are turned back to no avail
     max_wait: int = 20  # frames that have not moved since the last pair, before one is taken
 
 
 _TURNED = _TurnedRules()
 _CODE = "right-camera-turned"
+_CONTRADICTS = "right-contradicts-left"
 # corners of a pair, features of frames that were used, key points of pairs
 Evidence: TypeAlias = Literal["corners", "features", "pairs"]
 _AXES = "xyz"
@@ -83,6 +88,8 @@ class TurnedPair(ImageCheck):
         self._waited = 0  # frames that told nothing, of this evidence
         self._seen: Observations | None = None  # features of the frame before
         self._used_frames = False  # before the camera was suspected
+        self._onset = 0  # first frame of a camera that has turned during the run; 0: none has
+        self._contradicting = 0  # frames since images were turned back that still contradict
         self._points: TurnedPoints | None = None  # of the pairs so far
         self._last: Image | None = None  # the left image of the last of them, at half resolution
         self.rotation: FloatArray | None = None  # (3,) rad, that is taken back; None: none is
@@ -99,12 +106,24 @@ class TurnedPair(ImageCheck):
                 self._add_pair(images)
                 if self._looks_at == "pairs" and not self._used_frames:
                     return images.marked(skipped=True)
-                begins = self.rotation is not None
+                begins = self.rotation is not None and not self._onset
+        self._give_up()
         if self.rotation is None:
             return images
         left, right = images.raw
         back = images.with_raw((left, turned_back(right, self._camera, self.rotation)))
         return back.marked(begin_again=True) if begins else back
+
+    def _give_up(self) -> None:
+        """Use images as given that contradict the left ones for long though they are turned back:
+        the right camera has not turned.
+        """
+        if not self._onset or self.rotation is None:
+            return
+        self._contradicting += 1
+        if self._contradicting > _TURNED.max_contradicting:
+            self.rotation = None
+            self._onset = 0
 
     def see(self, seen: Observations) -> None:
         """Take the features of a frame that was used: the first ones between which the rig has
@@ -120,6 +139,24 @@ class TurnedPair(ImageCheck):
             self._used_frames = True
         else:
             self._wait(_TURNED.max_still, None)
+
+    def take(self, findings: Iterable[Finding]) -> None:
+        """Take what was found in a frame: where right images contradict left ones, the right
+        camera may have turned, and where they agree again, that is over.
+        """
+        for finding in findings:
+            if finding.code != _CONTRADICTS:
+                continue
+            if finding.ended:
+                if self._onset and self._looks_at == "pairs":
+                    self._look_at(None)
+                self._onset = 0
+            elif self._looks_at != "pairs":
+                self.rotation = None
+                self._onset = finding.first_frame or 0
+                self._used_frames = True
+                self._contradicting = 0
+                self._look_at("pairs")
 
     def _look_at(self, evidence: Evidence | None) -> None:
         self._looks_at = evidence
@@ -181,21 +218,20 @@ class TurnedPair(ImageCheck):
             self._look_at(None)
 
     def _report(self, index: int, found: PairRotation) -> None:
-        if not self._used_frames:
+        applied = self._onset > 0 or not self._used_frames
+        if applied:
             self.rotation = found.rotation
         angles = np.degrees(found.rotation)
         said = ", ".join(
             f"{angle:+.2f} ± {sigma:.2f} about {axis}"
             for angle, sigma, axis in zip(angles, np.degrees(found.sigmas), _AXES, strict=True)
         )
-        done = (
-            "the run corrects a part of it" if self._used_frames else "its images are turned back"
-        )
+        done = "its images are turned back" if applied else "the run corrects a part of it"
         message = (
             f"frame {index}: the right camera is turned against its calibration, degrees: {said}; "
             f"{done}; calibrate anew (vio calibrate)"
         )
         figures = {f"turned_{axis}_deg": float(a) for axis, a in zip(_AXES, angles, strict=True)}
         self._found.append(
-            Finding(_CODE, message, index, 0, lasts=self._used_frames, figures=figures)
+            Finding(_CODE, message, index, self._onset, lasts=not applied, figures=figures)
         )

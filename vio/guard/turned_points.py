@@ -124,7 +124,7 @@ class TurnedPoints:
 
     def _by_motion(self, before: _Pair, now: _Pair, start: FloatArray) -> PairRotation | None:
         """Return the rotation by the points that two pairs show."""
-        rows, others = _matched(before.left, now.left)
+        rows, others = matched_rows(before.left, now.left)
         first = before.z[rows]
         second = now.z[others]
         both = np.isfinite(first[:, 2]) & np.isfinite(second[:, 2])
@@ -152,7 +152,7 @@ def _in_both(left: Keypoints, right: Keypoints) -> FloatArray:
     """Return pixels `[ul vl ur vr]` (N, 4) of the key points of a left image; right ones are not a
     number where none matches.
     """
-    rows, others = _matched(left, right)
+    rows, others = matched_rows(left, right)
     z = np.full((len(left), 4), np.nan)
     z[:, :2] = left.pixels
     z[rows, 2:] = right.pixels[others]
@@ -167,7 +167,7 @@ def _is_constant(found: list[PairRotation]) -> bool:
     return bool((np.ptp(angles, axis=0) < allowed).all())
 
 
-def _matched(a: Keypoints, b: Keypoints) -> tuple[IntArray, IntArray]:
+def matched_rows(a: Keypoints, b: Keypoints) -> tuple[IntArray, IntArray]:
     """Return rows (M,) and (M,) of key points whose descriptors are clearly next to each other."""
     if min(len(a), len(b)) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
