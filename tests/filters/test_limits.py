@@ -158,7 +158,7 @@ def _overdispersed(
         for n in range(2):
             learned.add(
                 np.array([2 * k + n]),
-                np.array([[0.1 + 10.0 * k + n * apart_rad, 0.1]]),
+                np.array([[0.1 + 6.0 * k + n * apart_rad, 0.1]]),
                 np.full((1, 6), np.sqrt(ratio)),
                 np.ones((1, 6)),
             )

@@ -136,6 +136,11 @@ CORNERS: dict[str, tuple[Says, float, float]] = {
         19.0,
         27.0,
     ),
+    "in little noise": (
+        lambda x: _found(_half({(60, 40): x}, 0.5), 60, 40, features=100),
+        3.7,
+        5.0,
+    ),
     "in noise": (lambda x: _found(_half({(60, 40): x}, 2.0), 60, 40, features=100), 3.5, 4.6),
 }
 

@@ -19,7 +19,7 @@ from tests.guard.test_frozen_images import (
     _shifted,
     _watching,
 )
-from vio.monitor.frozen import FrozenImages, Repeated
+from vio.monitor.frozen import IMAGES, FrozenImages, Repeated, RepeatReport
 from vio.records import Image, observations
 
 Says = Callable[[float], bool]
@@ -73,12 +73,23 @@ def _held(moved_px: float, before_px: float = 0.0, lost: float = 0.0) -> bool:
     return frozen.take_held() is not None
 
 
+def _lines(rows: int) -> int:
+    """Lines on so many repetitions, each of which ends with the next frame."""
+    report = RepeatReport(IMAGES)
+    said = 0
+    for k in range(rows):
+        said += len(report.frame(_frame(2 * k, LEFT, RIGHT), Repeated(2 * k - 1, True)))
+        said += len(report.frame(_frame(2 * k + 1, LEFT, RIGHT), None))
+    return said
+
+
 LIMITS: dict[str, tuple[Says, float, float]] = {
     "predicted to move": (_nearly_equal, 0.85, 1.15),
     "predictions are off": (lambda x: not _nearly_equal(off_px=x), 0.43, 0.57),
     "unmoved": (lambda x: not _nearly_equal(moved_px=x), 0.11, 0.2),
     "unmoved: share": (lambda x: not _partly_moved(x), 0.1, 0.35),
     "unmoved: features": (lambda n: _nearly_equal(features=int(n)), 14, 15),
+    "lines": (lambda n: _lines(9) < n, 3, 4),
     "moved": (lambda x: _after_flow(x) is not None, 0.17, 0.24),
     "moved: features": (lambda n: _after_flow(2.0, int(n)) is not None, 14, 15),
     "begun": (_held, 1.8, 2.3),
