@@ -41,7 +41,8 @@ def controller(live):
         print(f"{ahead.time_ns * 1e-9:.3f} s  {x:8.3f} {y:8.3f} {z:8.3f} m")
 
 
-with vio.LiveOdometry(recording.camera, T_cam0_imu=recording.T_cam0_imu) as live:
+T_cam0_imu = recording.T_cam0_imu if samples else None  # images alone
+with vio.LiveOdometry(recording.camera, T_cam0_imu=T_cam0_imu) as live:
     print("warming up", flush=True)
     live.warm_up()  # compiles and loads: the first frame then takes no longer than others
     drivers = [camera_driver, imu_driver] if live.motion == "imu" else [camera_driver]

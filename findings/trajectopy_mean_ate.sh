@@ -4,7 +4,7 @@
 # are 0.19 and 0.33 m.
 # Guessed: an ATE is a root mean square.
 # Matters here: its figures lie below ours and below published ones for one and the same trajectory, so a system looks better by
-# the tool that measured it. Compare ours with `pos_dev_rms`, or with `ate_m.mean` of our metrics.
+# the tool that measured it. Compare ours with `pos_dev_rms`, or its ATE with the mean that `vio eval` prints.
 # Source: trajectopy.ate against the two sums written out; Sturm et al. (2012) for the root mean square; this run.
 set -euo pipefail
 folder=$(mktemp -d)

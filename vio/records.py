@@ -258,7 +258,13 @@ def observations(
             raise DataError(f"frame {frame_index}: ids are whole numbers, got {given.dtype}")
         ids_ = given.astype(np.int64)
         n = given.size
-        z_ = np.asarray(z, dtype=np.float64).reshape(-1, 4)
+        pixels = np.asarray(z, dtype=np.float64)
+        if pixels.ndim == 2 and pixels.size and pixels.shape[1] != 4:
+            raise DataError(
+                f"frame {frame_index}: z has the shape {pixels.shape}; give (N, 4), "
+                "[ul vl ur vr] of each id in a row"
+            )
+        z_ = pixels.reshape(-1, 4)
         right = (
             np.ones(n, dtype=np.bool_)
             if has_right is None

@@ -4,7 +4,7 @@ errors.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -173,6 +173,53 @@ def test_without_times_images_alone_are_read_and_it_is_said(tmp_path: Path) -> N
     ).recording
     assert np.diff(recording.frame_times_ns).tolist() == [100_000_000] * 3
     assert "frames are taken to be 0.1 s apart" in recording.notes[0]
+
+
+def _numbered(tmp_path: Path, numbers: Sequence[int]) -> Path:
+    """Write a folder without times whose images have these numbers."""
+    folder = make_plain(tmp_path, times=False, imu=False, reference=False)
+    for side in ("left", "right"):
+        files = sorted((folder / side).iterdir())
+        for file in files[len(numbers) :]:
+            file.unlink()
+        for file, number in reversed(list(zip(files, numbers, strict=False))):
+            file.rename(file.with_name(f"{number:06d}{file.suffix}"))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("numbers", "counts"),
+    [
+        ((0, 1, 2, 4), (0, 1, 2, 4)),  # lost images take their time
+        ((10, 20, 40, 50), (0, 1, 3, 4)),
+        ((0, 5, 10, 15), (0, 1, 2, 3)),
+        ((3, 4, 9, 11), (0, 1, 2, 3)),  # chosen images: no even series
+        ((0, 1, 2, 9), (0, 1, 2, 3)),  # more than half is missing
+    ],
+)
+def test_without_times_the_numbers_of_lost_images_take_their_time(
+    numbers: tuple[int, ...], counts: tuple[int, ...], tmp_path: Path
+) -> None:
+    recording = open_dataset(_numbered(tmp_path, numbers)).recording
+    assert recording.frame_times_ns.tolist() == [100_000_000 * count for count in counts]
+    holes = counts[-1] + 1 - len(counts)
+    assert (f"with the {holes} that the numbers leave out" in recording.notes[0]) == (holes > 0)
+
+
+def test_pairs_without_their_partner_take_their_time(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, times=False, imu=False, reference=False)
+    sorted((folder / "right").iterdir())[1].unlink()
+    recording = open_dataset(folder).recording
+    assert recording.frame_times_ns.tolist() == [0, 200_000_000, 300_000_000]
+
+
+def test_an_empty_folder_of_right_images_is_named(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    for file in (folder / "right").iterdir():
+        file.unlink()
+    recording = open_dataset(folder).recording
+    assert recording.camera.kind == "mono"
+    assert f"{folder / 'right'} holds no images" in recording.notes[0]
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,12 @@ def test_observations_that_contradict_themselves_are_refused() -> None:
         observations(5, 0, [1, 2, 1], np.zeros((3, 4)))
 
 
+@pytest.mark.parametrize("shape", [(4, 6), (6, 2), (3, 8)])
+def test_pixels_that_are_no_rows_of_four_are_refused_not_reshaped(shape: tuple[int, int]) -> None:
+    with pytest.raises(DataError, match=r"z has the shape .*; give \(N, 4\)"):
+        observations(0, 0, range(6), np.arange(float(np.prod(shape))).reshape(shape))
+
+
 def test_shared_rows_are_those_of_the_common_ids_in_their_order() -> None:
     rng = np.random.default_rng(0)
     for _ in range(100):

@@ -330,12 +330,36 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
         raise DataError(
             f"{file}: does not list {unlisted} ({_LIST_FORM}); copy both again, or remove the image"
         )
+    counts = _frame_counts(lefts)
+    holes = int(counts[-1]) + 1 - len(counts)
+    counted = f" (with the {holes} that the numbers leave out)" if holes else ""
     note = (
-        f"{layout.root}: no times.txt; frames are taken to be {1 / _ASSUMED_HZ:g} s apart, so "
-        "speeds are unknown; "
-        "write one time an image (seconds or nanoseconds) into times.txt"
+        f"{layout.root}: no times.txt; frames{counted} are taken to be {1 / _ASSUMED_HZ:g} s apart, "
+        "so speeds are unknown; write one time an image (seconds or nanoseconds) into times.txt"
     )
-    return np.arange(len(pairs), dtype=np.int64) * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
+    return counts * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
+
+
+def _frame_counts(files: Sequence[Path]) -> IntArray:
+    """Return how many frames after the first each image was taken (F,), with those that the numbers
+    of an even series leave out: lost images, or pairs without their partner.
+
+    Where numbers are no series, or half of it is missing (images that were chosen, a counter that
+    began again), images follow one another.
+    """
+    in_order = np.arange(len(files), dtype=np.int64)
+    numbers = [_last_number(file) for file in files]
+    if len(files) < 2 or not all(isinstance(number, int) for number in numbers):
+        return in_order
+    if max(map(int, numbers)) > np.iinfo(np.int64).max:
+        return in_order
+    values: IntArray = np.array(numbers, dtype=np.int64)
+    steps = values[1:] - values[:-1]
+    usual = int(np.median(steps))
+    if usual < 1 or (steps < usual).any() or (steps % usual != 0).any():
+        return in_order
+    counts = np.concatenate([[0], np.cumsum(steps // usual)])
+    return counts if counts[-1] < 2 * len(files) else in_order
 
 
 def _file_of_times(layout: Layout) -> Path | None:

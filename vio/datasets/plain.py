@@ -412,7 +412,18 @@ def read_mono(path: Path, settings: DatasetSettings) -> ImageDataset:
             "left/"
         )
     files = list_images(layout.left)
-    return _read("mono", layout, _Images(FilePairs(files, files)), settings)
+    images = _Images(FilePairs(files, files), _empty_partner_note(layout))
+    return _read("mono", layout, images, settings)
+
+
+def _empty_partner_note(layout: Layout) -> tuple[str, ...]:
+    """State that the folder of the right images is there, without any."""
+    for left, right in _PAIRS:
+        for inside in _INSIDE:
+            folder = layout.base / right
+            if layout.left == layout.base / left / inside and folder.is_dir():
+                return (f"{folder} holds no images: {layout.left} is read as one camera alone",)
+    return ()
 
 
 def read_rgbd(path: Path, settings: DatasetSettings) -> ImageDataset:
