@@ -15,7 +15,7 @@ from vio.frontend.right_delay import PairingCounts, at_exposure, at_present
 from vio.frontend.right_images import RightImages
 from vio.frontend.right_turn import PairShake, RightTurn
 from vio.frontend.stereo_fit import StereoFit
-from vio.frontend.stereo_match import ROW_SEARCH, shifted_rows
+from vio.frontend.stereo_match import ROW_SEARCH, mirrored, shifted_rows
 from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -227,9 +227,7 @@ def _count_either_sign(
     have.
     """
     positive = stereo.count_on_rows(left_half, right_half, points)
-    mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (left_half, right_half)]
-    flipped = points * [-1.0, 1.0] + [2.0 * (left_half.shape[1] - 1), 0.0]
-    return max(positive, stereo.count_on_rows(mirrored[0], mirrored[1], flipped))
+    return max(positive, stereo.count_on_rows(*mirrored(left_half, right_half, points)))
 
 
 def _rows_by_slot(old: Tracks, now: Tracks) -> IntArray:

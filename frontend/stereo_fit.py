@@ -21,6 +21,7 @@ from vio.frontend.stereo_match import (
     ROW_SEARCH,
     EpipolarRowModel,
     match_rows,
+    mirrored,
     shifted_rows,
 )
 from vio.frontend.tracks import ANCHOR_REACH_PX, INLIER_PX, AnchorBank, Tracks
@@ -283,9 +284,8 @@ class StereoFit:
 
     def count_mirrored(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that have a match with a negative disparity."""
-        a, b = (np.ascontiguousarray(view.half[:, ::-1]) for view in (left, right))
-        flipped = points * [-1.0, 1.0] + [2.0 * (a.shape[1] - 1), 0.0]
-        disparity, unique = self._search(a, b, flipped, MIN_CORRELATION)
+        flipped = mirrored(left.half, right.half, points)
+        disparity, unique = self._search(*flipped, MIN_CORRELATION)
         return int((unique & (disparity >= 1.0)).sum())
 
     def count_on_rows(self, left_half: Image, right_half: Image, points: FloatArray) -> int:

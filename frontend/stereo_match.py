@@ -169,6 +169,16 @@ def shifted_rows(image: Image, rows: int) -> Image:
     return np.ascontiguousarray(image[chosen])
 
 
+def mirrored(
+    left_half: Image, right_half: Image, points: FloatArray
+) -> tuple[Image, Image, FloatArray]:
+    """Return images (H/2, W/2) and left pixels (N, 2) of the full image with the columns in reverse
+    order, in which negative disparities are positive ones.
+    """
+    left, right = (np.ascontiguousarray(image[:, ::-1]) for image in (left_half, right_half))
+    return left, right, points * [-1.0, 1.0] + [2.0 * (left_half.shape[1] - 1), 0.0]
+
+
 @compiled
 def correlate(
     source: Image,

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vio.frontend.descriptors import Keypoints, OpenCvExtractor
+from vio.frontend.descriptors import OpenCvExtractor
 from vio.geometry.lie import FloatArray
-from vio.guard.turned_points import matched_rows
+from vio.guard.turned_points import matched_rows, pixels_in_both
 from vio.records import Image
 
 
@@ -42,11 +42,12 @@ def keeps_depth_order(before: tuple[Image, Image], now: tuple[Image, Image]) -> 
     extract = OpenCvExtractor("sift", _ORDER.keypoints)
     left_before, right_before = extract(*before)
     left, right = extract(*now)
-    known = _disparities(left_before, right_before, _ORDER.max_rows)
-    found = _disparities(left, right, np.inf)
     rows, others = matched_rows(left_before, left)
-    both = np.isfinite(known[rows]) & np.isfinite(found[others])
-    return have_same_order(known[rows[both]], found[others[both]])
+    known = pixels_in_both(left_before, right_before)[rows]
+    found = pixels_in_both(left, right)[others]
+    # not a number where none matches, so that it is left out as well
+    both = (np.abs(known[:, 1] - known[:, 3]) <= _ORDER.max_rows) & np.isfinite(found[:, 2])
+    return have_same_order(*(z[both, 0] - z[both, 2] for z in (known, found)))
 
 
 def have_same_order(one: FloatArray, other: FloatArray) -> bool:
@@ -61,12 +62,3 @@ def have_same_order(one: FloatArray, other: FloatArray) -> bool:
     correlation = float(same.sum()) / (n * (n - 1))
     sigma = float(np.sqrt(2.0 * (2 * n + 5) / (9.0 * n * (n - 1))))
     return correlation >= max(_ORDER.correlation, _ORDER.sigmas * sigma)
-
-
-def _disparities(left: Keypoints, right: Keypoints, max_rows: float) -> FloatArray:
-    """Return those (N,) of the key points of a left image; not a number where none matches."""
-    rows, others = matched_rows(left, right)
-    shift = left.pixels[rows] - right.pixels[others]
-    out = np.full(len(left), np.nan)
-    out[rows] = np.where(np.abs(shift[:, 1]) <= max_rows, shift[:, 0], np.nan)
-    return out

@@ -11,7 +11,7 @@ camera that has turned, but near points still have the larger ones (`vio.guard.d
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -53,30 +53,6 @@ class MatchCounts:
     points: int
     positive: int
     negative: int
-
-
-class _Changes(NamedTuple):
-    """Changes of the left and the right image since the last ones of both cameras."""
-
-    own: tuple[float, float]  # since its own camera's
-    other: tuple[float, float]  # since the other one's
-
-    @classmethod
-    def between(cls, now: tuple[Image, Image], last: tuple[Image, Image]) -> _Changes:
-        """Return those of images since the last ones."""
-        left, right = now
-        return cls(
-            (image_change(left, last[0]), image_change(right, last[1])),
-            (image_change(left, last[1]), image_change(right, last[0])),
-        )
-
-    def look_exchanged(self) -> bool:
-        """Whether each image is rather like the other camera's last one."""
-        own = self.own
-        other = self.other
-        # The motion shifts both images alike; or it shifts them by less than the disparity does.
-        unlike = abs(own[0] - own[1]) > abs(other[0] - other[1])
-        return unlike or sum(own) > sum(other)
 
 
 class ExchangeDetector(ImageCheck):
@@ -146,12 +122,11 @@ class ExchangeDetector(ImageCheck):
                 each other.
         """
         now: tuple[Image, Image] = (_thumbnail(left), _thumbnail(right))
-        changes = None if self._last is None else _Changes.between(now, self._last)
         order: Order = "given"
         if (
             suspicious
             or self._since is not None
-            or (changes is not None and changes.look_exchanged())
+            or (self._last is not None and _look_exchanged(now, self._last))
         ):
             order = _judge(count(), "given" if self._since is None else "exchanged")
             self._right_turned = order != "given" and (
@@ -189,6 +164,15 @@ class ExchangeDetector(ImageCheck):
                 f"with negative disparities only; {done}"
             )
             self._found.append(Finding("images-exchanged", message, index, lasts=True))
+
+
+def _look_exchanged(now: tuple[Image, Image], last: tuple[Image, Image]) -> bool:
+    """Whether each image is rather like the other camera's last one."""
+    own = [image_change(a, b) for a, b in zip(now, last, strict=True)]
+    other = [image_change(a, b) for a, b in zip(now, last[::-1], strict=True)]
+    # The motion shifts both images alike; or it shifts them by less than the disparity does.
+    unlike = abs(own[0] - own[1]) > abs(other[0] - other[1])
+    return unlike or sum(own) > sum(other)
 
 
 def _thumbnail(image: Image) -> Image:

@@ -10,7 +10,7 @@ import numpy as np
 
 from vio.frontend.detect import detect_corners
 from vio.frontend.settings import GridSettings
-from vio.frontend.stereo_match import ROW_SEARCH, match_rows, shifted_rows
+from vio.frontend.stereo_match import ROW_SEARCH, match_rows, mirrored, shifted_rows
 from vio.geometry.lie import FloatArray
 from vio.records import Image, IntArray
 
@@ -65,9 +65,7 @@ class RowProbe:
 
     def negative(self, left: Image, right: Image, points: FloatArray) -> int:
         """Count the pixels (N, 2) of the left image that match with a negative disparity."""
-        mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (left, right)]
-        flipped = points * [-1.0, 1.0] + [2.0 * (left.shape[1] - 1), 0.0]
-        return _signed(mirrored[0], shifted_rows(mirrored[1], self._rows), flipped)
+        return _signed(*mirrored(left, shifted_rows(right, self._rows), points))
 
     def on_rows(self, left: Image, right: Image, points: FloatArray) -> int:
         """Count the pixels (N, 2) of the left image that match well on their rows.

@@ -76,7 +76,7 @@ class TurnedPoints:
         camera.
         """
         left, right = OpenCvExtractor("sift", _POINTS.keypoints)(*images)
-        pair = _Pair(left, right, _in_both(left, right))
+        pair = _Pair(left, right, pixels_in_both(left, right))
         found = self._by_rows(pair.z)
         if found is None or not (
             self._rows_may_agree or is_turned_by_rows(np.degrees(found.rotation))
@@ -138,7 +138,7 @@ class TurnedPoints:
         least = _POINTS.clear_factor * self._rows[-1].points
         for before in self._pairs[-1 - _POINTS.max_delay : -1]:
             for left, right in ((before.left, now.right), (now.left, before.right)):
-                found = self._by_rows(_in_both(left, right))
+                found = self._by_rows(pixels_in_both(left, right))
                 if (
                     found is not None
                     and found.points > least
@@ -148,7 +148,7 @@ class TurnedPoints:
         return False
 
 
-def _in_both(left: Keypoints, right: Keypoints) -> FloatArray:
+def pixels_in_both(left: Keypoints, right: Keypoints) -> FloatArray:
     """Return pixels `[ul vl ur vr]` (N, 4) of the key points of a left image; right ones are not a
     number where none matches.
     """
