@@ -1025,9 +1025,11 @@ def test_settings_out_of_range(change: dict[str, int]) -> None:
         Msckf(CAMERA, T_CAM0_IMU, replace(EXACT_RIG, **change), motion=None)
 
 
-@pytest.mark.parametrize("motion", [None, "imu"])
+@pytest.mark.parametrize(
+    ("motion", "lost"), [(None, "P"), ("imu", "P"), ("imu", "error_D_constants")]
+)
 def test_restarts_from_the_last_good_pose_after_a_divergence(
-    motion: str | None, monkeypatch: pytest.MonkeyPatch
+    motion: str | None, lost: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frame 12 leaves a state of NaN: the filter raises, restarts, and its error stays within
     its covariance.
@@ -1039,7 +1041,7 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(
     class Fragile(Msckf):
         def update(self, observations: Observations) -> UpdateReport:
             if observations.frame_index == 12 and not events:
-                self._window.prior.P[0, 0] = np.nan
+                getattr(self._window.prior, lost)[:1] = np.nan
             try:
                 return super().update(observations)
             except DivergedError as error:

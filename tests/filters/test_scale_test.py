@@ -213,3 +213,10 @@ def test_the_share_of_noise_in_what_was_measured_is_not_known() -> None:
 def test_noise_may_hide_that_the_scale_is_smaller() -> None:
     """Noise passes for a larger scale only: it makes up for a part of one that is smaller."""
     assert after(97, 2091.0, -59.0).doubt() > 2.0 * after(0, 2091.0, -59.0).doubt()
+
+
+def test_what_a_diverged_filter_says_of_the_scale_is_passed_over() -> None:
+    test = ScaleTest()
+    for remaining in (2.0, np.nan, np.inf):
+        test.absorb(np.ones(1), 400.0 * np.ones(1), np.array([remaining]), np.zeros((1, 1)))
+        assert np.allclose(test.estimate(), (2.0 / 500.0, 500.0**-0.5))

@@ -1,7 +1,7 @@
 """Faults that are drawn, not chosen: kind, recording, size, moment and length from a seed.
 
     python -m tools.faults.draws --data DIR --seed S --draws N [--minutes M] [--kinds work|kept|all]
-        [--recordings work|kept|all] [--kind NAME …] [--out FILE]
+        [--recordings work|kept|all] [--kind NAME …] [--front-end NAME] [--out FILE]
     python -m tools.faults.draws --data DIR --seed S --one K
     python -m tools.faults.draws --table FILE …
 
@@ -94,17 +94,18 @@ def draw(seed: int, number: int, kinds: Sequence[str], sources: Sequence[Source]
 
 
 @dataclass(frozen=True, slots=True)
-class Folders:
-    """Where recordings and renders lie."""
+class Setup:
+    """Where recordings and renders lie, and the front end that sees them."""
 
     data: Path
     work: Path
+    front_end: str = "klt"
 
 
-def run_clean(source: Source, motion: MotionSource | None, folders: Folders) -> dict[str, Any]:
+def run_clean(source: Source, motion: MotionSource | None, setup: Setup) -> dict[str, Any]:
     """Run a recording as it is."""
-    dataset = _opened(source, folders)
-    outcome = _run(dataset, source, motion)
+    dataset = _opened(source, setup)
+    outcome = _run(dataset, source, motion, setup)
     row: dict[str, Any] = {"kind": CLEAN, "source": source.name, "motion": motion, "codes": []}
     if isinstance(outcome, VioError):
         return row | {"error": str(outcome)}
@@ -112,11 +113,11 @@ def run_clean(source: Source, motion: MotionSource | None, folders: Folders) -> 
     return row | {"ate_m": _ate_m(outcome)} | score(outcome, Usual(), 0, source.truth_sigma_m)
 
 
-def run_draw(drawn: Draw, clean: dict[str, Any], folders: Folders) -> dict[str, Any]:
+def run_draw(drawn: Draw, clean: dict[str, Any], setup: Setup) -> dict[str, Any]:
     """Run a draw, and compare it with its recording as it is."""
     source = next(s for s in SOURCES if s.name == drawn.source)
     kind = KINDS.get(drawn.kind) if drawn.half is not None else None
-    dataset = _opened(source, folders)
+    dataset = _opened(source, setup)
     times_ns = dataset.recording.frame_times_ns[: source.frames]
     period = _period(drawn, times_ns)
     variant = HEALTHY[drawn.kind] if kind is None else kind.make(drawn.size, drawn.rng)
@@ -124,7 +125,7 @@ def run_draw(drawn: Draw, clean: dict[str, Any], folders: Folders) -> dict[str, 
     onset = _onset(kind, period, times_ns)
     row: dict[str, Any] = asdict(drawn) | {"onset": onset, "clean_ate_m": clean.get("ate_m")}
     start = time.process_time()
-    outcome = _run(changed, source, drawn.motion)
+    outcome = _run(changed, source, drawn.motion, setup)
     row["cpu_s"] = round(time.process_time() - start, 1)
     if isinstance(outcome, VioError):
         return row | {"error": code_of(str(outcome)), "flagged_after": None, "silent": False}
@@ -133,8 +134,8 @@ def run_draw(drawn: Draw, clean: dict[str, Any], folders: Folders) -> dict[str, 
     return row | score(outcome, usual, onset, source.truth_sigma_m)
 
 
-def _opened(source: Source, folders: Folders) -> Dataset:
-    dataset = open_dataset(ready(source, folders.data, folders.work))
+def _opened(source: Source, setup: Setup) -> Dataset:
+    dataset = open_dataset(ready(source, setup.data, setup.work))
     return Changed(dataset, dataset.recording, iter)
 
 
@@ -151,8 +152,11 @@ def _onset(kind: Kind | None, period: Period, times_ns: np.ndarray) -> int:
     return int(np.searchsorted(times_ns, period.begin_ns))
 
 
-def _run(dataset: Dataset, source: Source, motion: MotionSource | None) -> RunResult | VioError:
-    config = load_config(overrides=[f"motion={motion or 'none'}"])
+def _run(
+    dataset: Dataset, source: Source, motion: MotionSource | None, setup: Setup
+) -> RunResult | VioError:
+    overrides = [f"motion={motion or 'none'}", f"frontend.name={setup.front_end}"]
+    config = load_config(overrides=overrides)
     stop = source.frames
     stop = None if stop is None else min(stop, len(dataset.recording.frame_times_ns))
     try:
@@ -209,6 +213,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--recordings", choices=("work", "kept", "all"), default="work")
     parser.add_argument("--kind", nargs="+", default=[], choices=sorted(KINDS), metavar="NAME")
     parser.add_argument("--one", type=int, metavar="K", help="run one draw and print its row")
+    parser.add_argument("--front-end", default="klt", choices=("klt", "orb", "sift"))
     parser.add_argument("--workers", type=int, default=2, metavar="W")
     parser.add_argument(
         "--work", type=Path, default=Path("results"), metavar="DIR", help="renders and rows"
@@ -235,23 +240,23 @@ def main() -> int:
         parser.error("--data takes the folder of recordings, as the end of docs/results.md says")
     kinds = options.kind or [n for n in KINDS if options.kinds in ("all", HALVES[n])]
     sources = [s for s in SOURCES if options.recordings in ("all", s.half)]
-    folders = Folders(options.data, options.work / "renders")
+    setup = Setup(options.data, options.work / "renders", options.front_end)
     drawing = partial(draw, options.seed, kinds=kinds, sources=sources)
     if options.one is not None:
         drawn = drawing(options.one)
         source = next(s for s in sources if s.name == drawn.source)
-        print(json.dumps(run_draw(drawn, run_clean(source, drawn.motion, folders), folders)))
+        print(json.dumps(run_draw(drawn, run_clean(source, drawn.motion, setup), setup)))
         return 0
-    _run_all([drawing(k) for k in range(options.draws)], sources, folders, options)
+    _run_all([drawing(k) for k in range(options.draws)], sources, setup, options)
     return 0
 
 
 def _run_all(
-    drawn: Sequence[Draw], sources: Sequence[Source], folders: Folders, options: argparse.Namespace
+    drawn: Sequence[Draw], sources: Sequence[Source], setup: Setup, options: argparse.Namespace
 ) -> None:
     """Run the draws that a file does not hold yet, and add them to it."""
     for source in sources:
-        ready(source, folders.data, folders.work)
+        ready(source, setup.data, setup.work)
     out = options.out or options.work / f"fault_draws-{options.seed}.jsonl"
     rows = rows_of(out)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -273,10 +278,10 @@ def _run_all(
                 yield row
 
         missing = [key for key in needed if key not in clean]
-        cleans = (partial(run_clean, by_name[name], motion, folders) for name, motion in missing)
+        cleans = (partial(run_clean, by_name[name], motion, setup) for name, motion in missing)
         clean |= {(row["source"], row["motion"]): row for row in kept(cleans)}
         works = (
-            partial(run_draw, d, clean[d.source, d.motion], folders)
+            partial(run_draw, d, clean[d.source, d.motion], setup)
             for d in wanted
             if (d.source, d.motion) in clean
         )

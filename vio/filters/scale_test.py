@@ -107,13 +107,15 @@ class ScaleTest:
             P: covariance of the errors (D, D) after them.
 
         What they say is 0 or more; where positions are known to kilometres only, after a clock that
-        stepped by an hour, rounding may leave less than the start had, and they are passed over.
+        stepped by an hour, rounding may leave less than the start had, and they are passed over. So
+        are those of a filter that has diverged, as a new start keeps what is known of the scale.
         """
         information = self._information + float(V @ W - W @ P @ W)
-        if not information >= _SCALE.log_sigma**-2:
+        vector = self._vector + float(V @ remaining)
+        if not information >= _SCALE.log_sigma**-2 or not np.isfinite(vector):
             return
         self._information = information
-        self._vector += float(V @ remaining)
+        self._vector = vector
 
     def estimate(self) -> tuple[float, float]:
         """Logarithm of the true scale over the filter's, and its standard deviation."""
