@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from tools.faults.changes import Period
-from tools.faults.columns import COLUMNS, ColumnChange, changed_features, during
+from tools.faults.columns import (
+    COLUMNS,
+    ColumnChange,
+    changed_features,
+    during,
+    onwards,
+    turned,
+)
 from vio.config import load_config
 from vio.errors import DataError
 from vio.findings import Finding
@@ -27,6 +34,7 @@ from vio.guard.lost_matches import LostMatches
 from vio.guard.match_check import Hysteresis, SharedMatches, shared_matches
 from vio.guard.matches import RightMatches
 from vio.guard.object_matches import ObjectMatches
+from vio.guard.shifted_matches import common_change
 from vio.records import Observations, Recording, StereoFrame, Trajectory, observations
 from vio.runs.pipeline import RunResult, run
 
@@ -41,6 +49,7 @@ CODES = {
     "right dark": ["right-matches-lost", "-right-matches-lost"],
     "right late": ["pairs-shifted"],
     "right rolled": ["right-contradicts-left"],
+    "right yawed": ["right-contradicts-left"],
     "object": ["object-covers-image"],
 }
 
@@ -99,7 +108,7 @@ def test_every_fault_of_the_columns_is_named_once(name: str) -> None:
     assert codes(inspected(changed(COLUMNS[name], flight()))[1]) == CODES[name]
 
 
-@pytest.mark.parametrize("name", ["right frozen", "right rolled"])
+@pytest.mark.parametrize("name", ["right frozen", "right rolled", "right yawed"])
 def test_no_right_pixel_of_a_fault_is_output(name: str) -> None:
     out, _ = inspected(changed(COLUMNS[name], flight()))
     assert not any(out[k].has_right.any() for k in FAULT)
@@ -168,6 +177,85 @@ def test_rows_must_jump_clearly(rows_px: float, named: bool) -> None:
 def test_rows_that_are_off_from_the_start_are_a_matter_of_the_calibration() -> None:
     pitched = [replace(o, z=o.z + np.array([0.0, 0.0, 0.0, 5.0])) for o in flight()]
     assert codes(inspected(pitched)[1]) == []
+
+
+@pytest.mark.parametrize(("degrees", "named"), [(0.05, False), (0.1, True), (-0.1, True)])
+def test_disparities_must_jump_clearly(degrees: float, named: bool) -> None:
+    """The limit is 0.07 degrees; half a pixel is 0.057 of them here."""
+    yawed = onwards(turned(degrees, (0.0, 1.0, 0.0)))
+    found = inspected(changed(yawed, flight()))[1]
+    assert codes(found) == (["right-contradicts-left"] if named else [])
+    if named:
+        assert found[0].first_frame == FAULT.start
+        assert found[0].figures["offset_px"] == pytest.approx(-500 * np.radians(degrees), abs=0.1)
+
+
+def test_right_pixels_that_shift_back_are_used_again() -> None:
+    yawed = during(turned(0.5, (0.0, 1.0, 0.0)))
+    out, found = inspected(changed(yawed, flight()))
+    assert codes(found) == ["right-contradicts-left", "-right-contradicts-left"]
+    assert all(record.has_right.any() == (k not in FAULT) for k, record in enumerate(out))
+
+
+def test_a_shift_that_descriptors_lose_for_some_frames_is_found() -> None:
+    """No feature of a frame has the right pixel that it had before; later ones have others."""
+
+    def lost(
+        seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
+    ) -> Observations:
+        if k in (15, 16, 17):
+            return replace(seen[k], has_right=seen[k].ids % 50 == k)
+        yawed = onwards(turned(0.5, (0.0, 1.0, 0.0)))
+        return yawed(seen, k, camera, period)
+
+    assert codes(inspected(changed(lost, flight()))[1])[-1] == "right-contradicts-left"
+
+
+@pytest.mark.parametrize(("degrees", "named"), [(0.0, False), (0.01, False), (0.04, True)])
+def test_right_pixels_of_a_pair_that_shakes_count_less(degrees: float, named: bool) -> None:
+    """By another angle in each frame; the limit is 0.02 degrees."""
+    angles = degrees * np.random.default_rng(5).normal(size=FRAMES)
+
+    def shaken(
+        seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
+    ) -> Observations:
+        return turned(angles[k], (0.0, 1.0, 0.0))(seen, k, camera, period)
+
+    seen = changed(shaken, flight())
+    out, found = inspected(seen)
+    assert codes(found) == (["right-camera-shakes"] if named else [])
+    assert all(record.has_right.all() for record in out)
+    sigma = out[-1].sigma
+    assert (sigma is not None) == named
+    if sigma is not None:
+        # all of a frame together are as uncertain as what they have in common
+        common_px = 500.0 * np.radians(degrees)
+        assert 0.5 < sigma[:, 2].mean() / (np.sqrt(len(sigma)) * common_px / 0.3) < 1.5
+        assert np.all(sigma[:, :2] == 1.0)
+
+
+@pytest.mark.parametrize("nearest_m", [3.0, 10.0, 19.0])
+def test_what_disparities_have_in_common_is_known_as_well_as_stated(nearest_m: float) -> None:
+    """Of a camera that goes ahead, sideways and turns; depths that are more alike say less."""
+    rng = np.random.default_rng(8)
+    ratios = []
+    sigmas = []
+    for _ in range(60):
+        points = rng.uniform([-10.0, -6.0, nearest_m], [10.0, 6.0, 20.0], (80, 3))
+        R = so3_exp(rng.normal(0.0, 0.03, 3))
+        both = []
+        for p in (points, points @ R.T - rng.uniform(-0.5, 0.5, 3)):
+            left = p[:, :2] / p[:, 2:] * 500.0 + [320.0, 240.0]
+            right = left - np.column_stack([150.0 / p[:, 2], np.zeros(len(p))])
+            both.append(np.hstack([left, right]) + rng.normal(0.0, 0.2, (len(p), 4)))
+        both[1][:, 2] += 1.5 * (1.0 + ((both[1][:, 2] - 320.0) / 500.0) ** 2)
+        found = common_change(CAMERA, SharedMatches(80, np.arange(80), *both, 0.1))
+        assert found is not None
+        ratios.append((found[0] + 1.5) / found[1])
+        sigmas.append(found[1])
+    assert 0.6 < np.std(ratios) < 2.0
+    assert abs(np.mean(ratios)) < 0.5
+    assert (np.median(sigmas) > 0.3) == (nearest_m > 15.0)
 
 
 def test_noisy_rows_are_usual() -> None:

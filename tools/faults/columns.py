@@ -81,21 +81,21 @@ def _dark(
     return replace(seen[k], has_right=np.zeros(len(seen[k]), dtype=np.bool_))
 
 
-def _rolled(degrees: float) -> ColumnChange:
-    """The right camera is turned about its axis."""
+def turned(degrees: float, axis: tuple[float, float, float]) -> ColumnChange:
+    """The right camera is turned about an axis (unit length)."""
 
-    def rolled(
+    def rotated(
         seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
     ) -> Observations:
         now = seen[k]
         K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
-        H = K @ so3_exp(np.radians(degrees) * np.array([0.0, 0.0, 1.0])) @ np.linalg.inv(K)
-        turned: FloatArray = np.column_stack([now.z[:, 2:], np.ones(len(now))]) @ H.T
+        H = K @ so3_exp(np.radians(degrees) * np.array(axis)) @ np.linalg.inv(K)
+        rays: FloatArray = np.column_stack([now.z[:, 2:], np.ones(len(now))]) @ H.T
         z = now.z.copy()
-        z[:, 2:] = turned[:, :2] / turned[:, 2:]
+        z[:, 2:] = rays[:, :2] / rays[:, 2:]
         return replace(now, z=z)
 
-    return rolled
+    return rotated
 
 
 _WALL_ID = 10**9  # of the first feature of the wall
@@ -139,7 +139,8 @@ COLUMNS: dict[str, ColumnChange] = {
     "exchanged": during(_exchanged),
     "right dark": during(_dark),
     "right late": _late,
-    "right rolled": onwards(_rolled(1.0)),
+    "right rolled": onwards(turned(1.0, (0.0, 0.0, 1.0))),
+    "right yawed": onwards(turned(0.5, (0.0, 1.0, 0.0))),
     "object": during(_object),
 }
 

@@ -37,6 +37,7 @@ FAULTS: dict[str, Variant] = {
     "right dark": pairs_during(lambda frame, left, right: (left, np.full_like(right, 5))),
     "right late": pairs(late_images, 1),
     "right rolled": pairs(turned_right, 1.0, (0.0, 0.0, 1.0), all_along=False),
+    "right yawed": pairs(turned_right, 0.5, (0.0, 1.0, 0.0), all_along=False),
     "object": pairs(moving_object, Wall(6.0)),
 }
 

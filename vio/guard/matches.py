@@ -10,17 +10,25 @@ from vio.guard.frozen_matches import FrozenMatches
 from vio.guard.late_matches import LateMatches
 from vio.guard.lost_matches import LostMatches
 from vio.guard.match_check import MatchCheck, shared_matches
+from vio.guard.shifted_matches import ShiftedMatches
 from vio.records import Observations
 
 
 def match_checks(camera: StereoCamera) -> tuple[MatchCheck, ...]:
     """Return the checks of right matches for a camera, in their order; none for one camera.
 
-    Frozen pixels contradict the rows as well, and late ones are learned from rows that fit.
+    Frozen pixels contradict the rows as well, and late ones are learned from rows that fit. Late ones
+    of a rig that turns shift all disparities until they are paired anew.
     """
     if camera.kind != "stereo":
         return ()
-    return (LostMatches(), FrozenMatches(), DisplacedMatches(camera), LateMatches(camera))
+    return (
+        LostMatches(),
+        FrozenMatches(),
+        DisplacedMatches(camera),
+        LateMatches(camera),
+        ShiftedMatches(camera),
+    )
 
 
 class RightMatches(Finder):
