@@ -28,6 +28,7 @@ from vio.frontend.frames import FrameValidator, Stopwatch, make_output
 from vio.frontend.outliers import MotionPriors, RansacProblem, predicted_motion, static_tracks
 from vio.frontend.patches import inside
 from vio.frontend.prediction import moved_pixels, prior_pixels, usable_prior
+from vio.frontend.right_camera import most_contradict
 from vio.frontend.scene_motion import MovedPoints, SceneMotion
 from vio.frontend.settings import FrontendSettings, MatchSettings
 from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, EpipolarRowModel
@@ -455,7 +456,10 @@ class DescriptorFrontend:
             change = np.abs(
                 pixels[:, 0] - right[:, 0] - self._camera.fu * self._camera.baseline_m / depth
             )
-            agrees = agrees & (~known | (change <= _MATCHES.inlier_px))
+            fits = ~known | (change <= _MATCHES.inlier_px)
+            # where most do not fit, the right camera is to be judged, by `vio.guard`
+            if not most_contradict(fits[known & keep & agrees]):
+                agrees = agrees & fits
         rows = rows[keep]
         found = found[keep]
         used[found] = True

@@ -37,6 +37,16 @@ _CODE = "right-contradicts-left"
 _UNKNOWN_CODE = "right-matches-missing"
 
 
+def most_contradict(matched: BoolArray) -> bool:
+    """Whether so few of the points (K,) of known depth are in the right image where they should be
+    that it is not a matter of single matches.
+    """
+    return (
+        len(matched) >= _CONTRADICTION.min_points
+        and share_of(matched) < _CONTRADICTION.contradicting_share
+    )
+
+
 class RightCamera(Finder):
     """Decides frame by frame whether the right image may be used."""
 
@@ -129,7 +139,7 @@ class RightCamera(Finder):
                 and share >= _CONTRADICTION.agreeing_share
             )
             self._count_agreement(index, tested=tested, agrees=agrees)
-        elif tested and share < _CONTRADICTION.contradicting_share:
+        elif moved and most_contradict(matched):
             self._begin(index)
         else:
             self._agreed += tested and share >= _CONTRADICTION.agreeing_share

@@ -52,6 +52,13 @@ _CODE = "right-camera-turned"
 _SHAKE_CODE = "right-camera-shakes"
 
 
+def jump_limit_px(focal_px: float) -> float:
+    """By how much all disparities change together, from one frame to the next, where a camera with
+    this focal length has turned.
+    """
+    return max(_TURN.jump_px, focal_px * _TURN.jump_rad)
+
+
 class RightTurn(Finder):
     """Finds an offset of disparities that stays, and reports it."""
 
@@ -75,8 +82,7 @@ class RightTurn(Finder):
         """Whether the disparities of a frame differ from those of the frame before by more than
         noise.
         """
-        limit_px = max(_TURN.jump_px, self._focal_px * _TURN.jump_rad)
-        return common_px is not None and abs(common_px) > limit_px
+        return common_px is not None and abs(common_px) > jump_limit_px(self._focal_px)
 
     def is_offset(self, offset_px: float | None) -> bool:
         """Whether disparities are off by more than noise; of a pair that shakes, all are."""
@@ -126,7 +132,8 @@ class PairShake(Finder):
 
     def __init__(self, focal_px: float) -> None:
         super().__init__()
-        self._limit_px = max(_SHAKE.min_px, focal_px * _SHAKE.min_rad)
+        # of the common error, beyond which a pair is said to shake
+        self.limit_px = max(_SHAKE.min_px, focal_px * _SHAKE.min_rad)
         self._common_px = deque[float](maxlen=_SHAKE.recent_frames)
         self._matched = 0
         self._reported = False
@@ -139,7 +146,7 @@ class PairShake(Finder):
         together are as uncertain as what they have in common; 1: the pair is firm.
         """
         sigma_px = self.sigma_px
-        if sigma_px <= self._limit_px:
+        if sigma_px <= self.limit_px:
             return 1.0
         return float(np.sqrt(1.0 + self._matched * (sigma_px / _SHAKE.pixel_sigma_px) ** 2))
 
@@ -152,7 +159,7 @@ class PairShake(Finder):
             return
         self._common_px.append(common_px)
         self.sigma_px = self._measured_px()
-        shakes = self.sigma_px > self._limit_px
+        shakes = self.sigma_px > self.limit_px
         if shakes and not self._reported:
             self._reported = True
             message = (
@@ -165,7 +172,7 @@ class PairShake(Finder):
             self._found.append(
                 Finding(_SHAKE_CODE, message, index, since, lasts=True, figures=figures)
             )
-        elif self.sigma_px < 0.5 * self._limit_px:
+        elif self.sigma_px < 0.5 * self.limit_px:
             self._end(index)
 
     def explained(self, index: int) -> None:

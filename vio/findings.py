@@ -92,7 +92,7 @@ def worst(effects: list[Integrity]) -> Integrity:
 
 
 _EXPOSURES = "pair images by their times of exposure, or synchronise the cameras"
-_CAMERA = "check the camera, its cable and its driver"
+_CAMERA = "check camera, cable and driver"
 
 CODES: dict[str, Code] = {
     "bands": Code(
@@ -238,9 +238,13 @@ CODES: dict[str, Code] = {
     ),
     "imu-not-used": Code(
         "degraded",
-        "the IMU was found to be wrong; frames were estimated again without it, or with corrected "
-        "units",
+        "frames were estimated again without the IMU, or with corrected units",
         "correct the fault that is named before",
+    ),
+    "imu-in-doubt": Code(
+        "degraded",
+        "the IMU looks useless so far, and is left out",
+        "see the message",
     ),
     "imu-clock": Code(
         "degraded", "the clocks of camera and IMU are apart", "use one clock, or calibrate"

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,16 @@ from tests.monitor.test_inertial_check import Watched, _recording
 from vio import evaluate, load_config, run
 from vio.imu.findings import ImuVerdict, InertialFinding
 from vio.live.odometry import Odometry
-from vio.records import Event, ImuSample, Observations, Recording, StereoFrame, Trajectory
+from vio.records import (
+    Estimate,
+    Event,
+    FrameResult,
+    ImuSample,
+    Observations,
+    Recording,
+    StereoFrame,
+    Trajectory,
+)
 from vio.runs.pipeline import RunControl, RunResult
 from vio.runs.recorder import GrowingFolder
 
@@ -94,8 +104,9 @@ def test_a_unit_is_applied_from_the_start(
 ) -> None:
     result = _run(_flight(gyro, accel), folder=tmp_path / "run")
     assert _worst_m(result.trajectory, as_recorded.trajectory) < 0.01
-    (line,) = [line for line in result.warnings if "estimated again" in line]
-    assert "readings are multiplied by" in line
+    first, last = [line for line in result.warnings if "estimated again" in line]
+    assert "is not used until" in first
+    assert "readings are multiplied by" in last
     written = (tmp_path / "run" / "trajectory.tum").read_text().splitlines()
     assert sum(not row.startswith("#") for row in written) == FRAMES
     assert np.allclose(
@@ -107,8 +118,72 @@ def test_without_a_factor_images_alone_go_on(alone: Trajectory) -> None:
     """Not one pose of the frames before the verdict is left of the estimate that was lost."""
     result = _run(_flight(axes=(1, 0, 2)))
     assert _worst_m(result.trajectory, alone) < 0.03
-    (line,) = [line for line in result.warnings if "estimated again" in line]
-    assert "the IMU is not used, and images alone go on" in line
+    first, last = [line for line in result.warnings if "estimated again" in line]
+    assert "is not used until" in first
+    assert "the IMU is not used, and images alone go on" in last
+
+
+class _Shown:
+    """What a run shows of each frame, before later ones correct it."""
+
+    def __init__(self) -> None:
+        self.estimates: list[Estimate] = []
+
+    def frame(self, result: FrameResult) -> None:
+        self.estimates.append(result.estimate)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("flight", "doubted"),
+    [
+        ({"gyro": 180 / np.pi}, 40),
+        ({"accel": 1 / 9.80665}, 22),
+        ({"accel": 100.0}, 22),
+        ({"axes": (1, 0, 2)}, 40),
+    ],
+    ids=["deg/s", "g", "cm/s^2", "axes"],
+)
+def test_an_imu_that_looks_useless_is_left_out_before_that_is_certain(
+    flight: dict[str, Any], doubted: int, alone: Trajectory
+) -> None:
+    """It takes 100 frames to be certain; from 20 or 40 on each is shown as by images alone, and none
+    as unusable.
+    """
+    shown = _Shown()
+    result = run(_flight(**flight), load_config(overrides=["motion=imu"]), viewer=shown)
+    doubts = [f for f in result.findings if f.code == "imu-in-doubt"]
+    assert [f.ended for f in doubts] == [False, True]
+    assert doubts[0].frame <= doubted
+    assert doubts[1].frame > 80
+    for k in range(doubted, 80):
+        assert shown.estimates[k].integrity == "degraded"
+        T = shown.estimates[k].T_world_imu
+        assert np.linalg.norm(T[:3, 3] - alone.positions[k]) < 0.03
+
+
+def test_an_imu_whose_first_second_was_wrong_is_used_once_its_size_is_right() -> None:
+    flight = _flight()
+    wrong_ns = flight.samples[0].time_ns + 1_100_000_000
+    samples = [
+        replace(s, accel=0.1 * s.accel) if s.time_ns < wrong_ns else s for s in flight.samples
+    ]
+    shown = _Shown()
+    result = run(
+        replace(flight, samples=samples), load_config(overrides=["motion=imu"]), viewer=shown
+    )
+    doubts = [f for f in result.findings if f.code == "imu-in-doubt"]
+    assert [f.ended for f in doubts] == [False, True]
+    assert doubts[1].frame < 80
+    line = next(f.message for f in result.findings if "the IMU is used;" in f.message)
+    assert line.startswith(f"frame {doubts[1].frame}:")
+    assert shown.estimates[-1].gravity_world is not None or shown.estimates[-1].tilt_sigma_rad
+
+
+def test_a_healthy_imu_is_never_in_doubt(as_recorded: RunResult) -> None:
+    assert not [f for f in as_recorded.findings if f.code == "imu-in-doubt"]
 
 
 def test_a_right_imu_is_used_to_the_bit_as_without_a_trial(

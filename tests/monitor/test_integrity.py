@@ -83,7 +83,7 @@ def test_innovations_beyond_what_is_stated_inflate_the_covariance() -> None:
     assert variances(6.0, [4e-4, 4e-4, 4e-4, 4e-4, 5e-4])[-1] == pytest.approx(5e-4 + 8e-4)
     assert variances(1.0, 6 * [5e-4])[-1] == pytest.approx(5e-4 + 8e-4)
     assert variances(1.0, [2.5e-4])[-1] == pytest.approx(2.5e-4 + 4e-4)
-    monitor.forget_innovations()
+    monitor.begin_again()
     assert variances(1.0, [2.5e-4]) == [2.5e-4]
 
 

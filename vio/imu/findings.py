@@ -85,10 +85,17 @@ class ImuVerdict:
     usable: bool = True
     gyro_factor: float = 1.0  # on its readings
     accel_factor: float = 1.0
+    # they look useless, which is not certain yet, or why is not known
+    in_doubt: bool = False
+
+    @property
+    def used(self) -> bool:
+        """Whether readings are used, for now."""
+        return self.usable and not self.in_doubt
 
     def after(self, finding: InertialFinding) -> ImuVerdict:
         """Return the verdict with one more finding."""
-        if not finding.certain or finding.fault not in _UNUSABLE:
+        if not finding.is_disabling:
             return self
         if finding.factor is None:
             return replace(self, usable=False)
@@ -112,6 +119,11 @@ class InertialFinding:
     def code(self) -> str:
         """Its code in `vio.findings`."""
         return _CODES[self.fault] if self.certain else "imu-suspected"
+
+    @property
+    def is_disabling(self) -> bool:
+        """Whether the readings are of no use to a filter, unless they are multiplied by a factor."""
+        return self.certain and self.fault in _UNUSABLE
 
     @property
     def message(self) -> str:

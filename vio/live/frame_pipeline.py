@@ -77,7 +77,8 @@ class FramePipeline:
         if self._motion is not None:
             if self._trial is not None:
                 self._trial.take_samples(samples)
-            self.backend.propagate_all(corrected_all(samples, self._imu))
+            if usable := corrected_all(samples, self._imu):
+                self.backend.propagate_all(usable)
         self._propagate_ms += 1e3 * (time.perf_counter() - start)
 
     def frame(self, frame: StereoFrame) -> FrameResult | None:

@@ -2,9 +2,10 @@
 unit or without them.
 
 A wrong unit, axis or sign is certain only after seconds of motion, and by then the estimate is
-lost. So the first minute of what the back end was given is kept beside a back end that has not
-begun. Once the monitor is certain, that one takes all of it again, and its estimates replace those
-before. Features are tracked well without the filter's prediction, so they are not extracted again.
+lost; that something is wrong shows in the first one. So the first minute of what the back end was
+given is kept beside a back end that has not begun. Once the IMU is in doubt, and once the monitor is
+certain, that one takes all of it again, and its estimates replace those before. Features are
+tracked well without the filter's prediction, so they are not extracted again.
 """
 
 from __future__ import annotations
@@ -57,18 +58,22 @@ class ImuTrial:
             self.close()
 
     def again(self, verdict: ImuVerdict) -> tuple[Backend, dict[int, Estimate]] | None:
-        """Give everything to a new back end, with the IMU that a verdict leaves; nothing can be
-        taken again then.
+        """Give everything to a new back end, with the IMU that a verdict leaves; but while it is in
+        doubt, nothing can be taken again then.
 
         Return that back end and its estimates by frame number; None: it is lost, too.
         """
         backend = self._fresh
         taken = self._taken
         assert backend is not None
-        self.close()
+        if verdict.in_doubt:
+            backend = copy.deepcopy(backend)
+        else:
+            self.close()
         try:
             return backend, _estimates(backend, taken, verdict)
         except EstimationError:
+            self.close()
             return None
 
 
@@ -101,7 +106,7 @@ def corrected(sample: MotionSample, verdict: ImuVerdict) -> MotionSample | None:
     """Return a sample in the right units; None: it is not to be used."""
     if verdict is AS_GIVEN or verdict == AS_GIVEN or not isinstance(sample, ImuSample):
         return sample
-    if not verdict.usable:
+    if not verdict.used:
         return None
     return replace(
         sample, gyro=verdict.gyro_factor * sample.gyro, accel=verdict.accel_factor * sample.accel

@@ -10,6 +10,7 @@ explanation does not; for equations (I1) to (I4) see docs/inertial.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from vio.monitor.force_fit import FIRST_EVALUATION, MIN_WINDOWS, Evidence, fit_f
 from vio.monitor.gyro_fit import GyroFit, fit_gyro, judge_offset, judge_stamps
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.monitor.rotation_comparison import compare_rotations, judge_rotations
-from vio.monitor.samples import Samples, Size, judge_size
+from vio.monitor.samples import Samples, Size, is_long_enough, judge_size
 from vio.records import (
     ROTATION_NOT_COMPARABLE,
     S_PER_NS,
@@ -68,6 +69,9 @@ class InertialCheck:
         self._coverage = SampleCoverage()
         self._frames = 0
         self._jumped = False
+        self._size_judged = False  # at least for the time being
+        # a magnitude that is not that of gravity, by the first readings, while its cause is not known
+        self._odd_size = ""
         self.reset()
 
     def reset(self) -> None:
@@ -76,6 +80,7 @@ class InertialCheck:
         self._motion = RecentMotion()
         self._since_evaluation = self._seen = 0
         self._suspected: set[InertialFault] = set()
+        self._fault = ""  # what makes the IMU useless, by the newest judgement alone
         self.done = False  # whether the comparison of motions has ended
         # the newest comparison; None: too few frames yet
         self.rotation_comparison: RotationComparison | None = None
@@ -84,6 +89,11 @@ class InertialCheck:
         self.clipped = False  # samples at the end of a range were left out
         # by the newest judgement of units, axes, signs and clocks, reported yet or not
         self.imu_at_fault = False
+
+    @property
+    def doubt(self) -> str:
+        """What makes the IMU useless if it is confirmed; nothing: there is no such doubt."""
+        return self._odd_size or self._fault
 
     def begin_after_jump(self) -> None:
         """Restart where the gyro's bias has jumped, as no linear map fits readings before and
@@ -104,6 +114,8 @@ class InertialCheck:
         self._frames += 1
         self._coverage.frame(observations.time_ns, self._samples.last_ns)
         found = self._coverage.so_far(self._samples.span_ns, self._samples.step_s / S_PER_NS)
+        if not self._size_judged:
+            self._judge_first_size()
         if not self.done:
             found += self._compare(observations)
         elif self._frames % BATCH == 0:
@@ -119,7 +131,17 @@ class InertialCheck:
             if motion is not None:
                 self._motion.add(motion)
             found += self._judge(last=True)
+        self._odd_size = self._fault = ""
         return self._unreported(found)
+
+    def _judge_first_size(self) -> None:
+        """Judge the accelerometer's magnitude as soon as readings show it, without any motion."""
+        times_ns, values = self._samples.so_far()
+        if len(times_ns) < 2 or not is_long_enough(times_ns):
+            return
+        size = judge_size(times_ns, values[:, 3:])
+        self._size_judged = True
+        self._odd_size = "" if size.finding is None else size.finding.seen
 
     def _compare(self, observations: Observations) -> list[InertialFinding]:
         """Add a frame's features, and evaluate when there is enough motion.
@@ -147,6 +169,11 @@ class InertialCheck:
         self._suspected = {f.fault for f in judged}
         return found
 
+    def _doubt_if(self, judged: Sequence[InertialFinding]) -> None:
+        """Doubt the IMU where a judgement says that it is useless, which is not reported yet."""
+        new = (f.seen for f in judged if f.is_disabling and f.group not in self._reported)
+        self._fault = next(new, "")
+
     def _judge(self, *, last: bool) -> list[InertialFinding]:
         """Evaluate the stored samples and motions."""
         times_ns, values = self._samples.table()
@@ -154,6 +181,8 @@ class InertialCheck:
             return []
         size = judge_size(times_ns, values[:, 3:])
         self.imu_at_fault = size.finding is not None
+        if size.finding is None:
+            self._odd_size = ""
         motion = self._motion.joined()
         if motion is None:
             return [] if size.finding is None else [size.finding]
@@ -218,6 +247,8 @@ class InertialCheck:
         found = self._judge_size_and_rates(size, record, gyro_fit, rotation)
         forces, measured = self._judge_force(evidence, size, rotation)
         found += forces
+        # which of gyro and extrinsics is at fault may be open yet
+        self._doubt_if([*found, *judge_gyro(replace(evidence, force_final=True), size.unit or 1.0)])
         self.imu_at_fault |= _shows_fault(found, evidence)
         force_is_settled = measured or size.unit is None or bool(rotation)
         enough = force_is_settled and _has_enough_rotation(gyro_fit)
@@ -274,8 +305,18 @@ class InertialCheck:
         record = record_of(motion, times_ns, values)
         gyro_fit = fit_gyro(record, _EVALUATIONS.min_intervals_at_end)
         turns = None if gyro_fit is None else compare_rotations(record, gyro_fit, self._T[:3, :3])
-        if turns is not None and np.isfinite(turns.sigma) and turns.agree:
+        if gyro_fit is None or turns is None:
+            return
+        if np.isfinite(turns.sigma) and turns.agree:
             self.rotation_comparison = turns
+            self._fault = ""
+            return
+        from vio.monitor.gyro import judge_gyro
+
+        clipped = self.clipped or "saturation" in self._reported
+        # what axes and unit are at fault is not asked yet
+        evidence = Evidence(self._T[:3, :3], gyro_fit, None, None, True, clipped, False)
+        self._doubt_if(judge_gyro(evidence, 1.0))
 
     def _compare_rotations(self, record: Record, gyro_fit: GyroFit) -> list[InertialFinding]:
         """Compare the camera's rotation with the gyro's until they differ beyond doubt."""
@@ -292,6 +333,8 @@ class InertialCheck:
             if finding.group not in self._reported:
                 self._reported.add(finding.group)
                 out.append(finding)
+                if finding.is_disabling:
+                    self._odd_size = self._fault = ""
         return tuple(out)
 
 

@@ -26,6 +26,8 @@ from vio.numerics.robust import median
 from vio.records import NS_PER_S, Estimate
 
 _HOLDS_NS = NS_PER_S  # an event without an end is one of the second after it
+# findings on the state that was estimated, not on a sensor
+_OF_THE_STATE = ("estimate-implausible", "estimate-restarted", "estimate-lost", "scale-off")
 _MIN_SPEED_MPS = 0.1  # of a rig that stands still as far as the estimate says
 # Levels of what the scale may be off by, over it: the first one, and from one to the next. Where
 # one is reached, earlier frames below it are brought to it.
@@ -121,10 +123,18 @@ class IntegrityMonitor:
         if ratio is not None:
             self._ratios.append(ratio)
 
-    def forget_innovations(self) -> None:
-        """Forget what they said, as the sensor is not used any more, and all was estimated anew."""
+    def begin_again(self) -> None:
+        """Forget what was judged of a state that another one replaces from the first frame on."""
         self._ratios.clear()
         self._misled_m = 0.0
+        self._last = None
+        self._speed_mps = _MIN_SPEED_MPS
+        self._unusable_since_ns = None
+        self._carried_m = 0.0
+        self._doubt_m = 0.0
+        for code in _OF_THE_STATE:
+            self._holding.pop(code, None)
+        self._new = [finding for finding in self._new if finding.code not in _OF_THE_STATE]
 
     def take_marks(self) -> tuple[Mark, ...]:
         """Return the marks of earlier frames since the last call."""

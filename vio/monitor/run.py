@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_DOUBT = "imu-in-doubt"
 # groups of faults without whose cure one camera finds no scale
 _PREVENTS_START = ("size", "overlap")
 
@@ -182,6 +183,18 @@ class RunMonitor:
             self._add([Finding("images-held", message, seen.frame_index, held_since)])
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
+            self._doubt_imu(self._inertial.doubt)
+
+    def _doubt_imu(self, why: str) -> None:
+        """Take why the IMU is not to be used for now; nothing: it may be used."""
+        if bool(why) == self.imu_verdict.in_doubt:
+            return
+        self.imu_verdict = replace(self.imu_verdict, in_doubt=bool(why))
+        message = f"frame {self._index}: the IMU is in doubt: {why}"
+        if not why:
+            message = f"frame {self._index}: the IMU is not in doubt any more"
+        finding = Finding(_DOUBT, message, self._index, lasts=bool(why), ended=not why)
+        self._add([finding])
 
     @property
     def rotation_comparison(self) -> RotationComparison | None:
@@ -231,21 +244,24 @@ class RunMonitor:
 
     def begun_again(self, index: int, verdict: ImuVerdict, frames: int) -> None:
         """Report that the frames so far were estimated again with what is left of the IMU."""
-        self._refusals.imu = verdict.usable
+        self._refusals.imu = verdict.used
         what = "the IMU is not used, and images alone go on"
-        if verdict.usable:
+        if verdict.in_doubt:
+            what = "the IMU is not used until motion shows what is wrong with it"
+        elif verdict.usable:
             parts = (("gyro", verdict.gyro_factor), ("accelerometer", verdict.accel_factor))
             factors = [
                 f"the {name}'s readings are multiplied by {factor:.6g}"
                 for name, factor in parts
                 if factor != 1
             ]
-            what = " and ".join(factors)
+            what = " and ".join(factors) or "the IMU is used"
         line = f"frame {index}: {what}; the {frames} frames so far were estimated again"
         self._report("imu-not-used", [line])
         if self._contradiction is not None:
             self._add(self._contradiction.end(index))
-            self._integrity.forget_innovations()
+        self._health.begun_again()
+        self._integrity.begin_again()
 
     def waiting(self, frame: StereoFrame, why: str) -> None:
         """Add a frame without a pose, as the back end's start is not observable yet; `why` is
@@ -334,6 +350,7 @@ class RunMonitor:
             self._add(self._faults.finish())
         if self._inertial is not None:
             self._report_findings(self._inertial.finish())
+            self._doubt_imu(self._inertial.doubt)
         self._report_scale(last=True)
         self._report_no_pose()
         self._integrity.close(self._index)

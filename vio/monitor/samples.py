@@ -106,6 +106,15 @@ class Samples:
         self._new = []
         return found
 
+    def so_far(self) -> tuple[IntArray, FloatArray]:
+        """Return `table` with the readings that were not checked yet."""
+        times, values = self.table()
+        if not self._new:
+            return times, values
+        new = np.array([s.time_ns for s in self._new], dtype=np.int64)
+        readings = np.array([[*s.gyro, *s.accel] for s in self._new])
+        return np.concatenate([times, new]), np.concatenate([values, readings])
+
     def table(self) -> tuple[IntArray, FloatArray]:
         """Return times (S,) and readings (S, 6) [gyro; accel]."""
         if not self._times:
@@ -211,10 +220,15 @@ class Size:
     clear: bool = True  # False: biased readings without gravity can have this magnitude, too
 
 
+def is_long_enough(times_ns: IntArray) -> bool:
+    """Whether readings at times (S,) span so much that their magnitude can be judged."""
+    return bool((times_ns[-1] - times_ns[0]) * S_PER_NS >= _SIZE.min_s)
+
+
 def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
     """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,)."""
     t = np.asarray((times_ns - times_ns[0]) * S_PER_NS, dtype=np.float64)
-    if t[-1] < _SIZE.min_s:
+    if not is_long_enough(times_ns):
         return Size(None, 1.0)
     integral = np.concatenate(
         [np.zeros((1, 3)), np.cumsum(np.diff(t)[:, None] * (accel[1:] + accel[:-1]) / 2, axis=0)]
