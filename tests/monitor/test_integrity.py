@@ -87,6 +87,28 @@ def test_innovations_beyond_what_is_stated_inflate_the_covariance() -> None:
     assert variances(1.0, [2.5e-4]) == [2.5e-4]
 
 
+def test_distances_without_a_scale_are_uncertain_by_its_walk() -> None:
+    """0.2 m a frame; a walk of 0.5 % in a frame is 5 % after 100."""
+    monitor = IntegrityMonitor()
+
+    def sigmas(frames: range, measured: bool | None) -> list[float]:
+        found = []
+        for k in frames:
+            monitor.take_scale(measured=measured)
+            judged = monitor.judged(k, replace(estimate(k), covariance=np.zeros((6, 6))))
+            found.append(float(np.sqrt(judged.covariance[0, 0])))
+        return found
+
+    assert sigmas(range(10), True) == 10 * [0.0]
+    walk = sigmas(range(10, 110), False)
+    # the sum of a walk over n frames has a variance of n^3 / 3
+    assert walk[-1] == pytest.approx(0.2 * 0.005 * np.sqrt(100**3 / 3), rel=0.02)
+    assert sigmas(range(110, 115), None)[-1] > walk[-1]  # nothing is seen: it is not known again
+    before = sigmas(range(115, 116), False)[0]
+    # lengths are measured again, where the rig is is not
+    assert sigmas(range(116, 130), True) == pytest.approx(14 * [before])
+
+
 def test_information_leaves_an_estimate_nominal() -> None:
     monitor = IntegrityMonitor()
     monitor.take(Finding("stereo-calibration-off", "", 0))

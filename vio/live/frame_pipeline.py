@@ -119,7 +119,7 @@ class FramePipeline:
         self.monitor.begun(frame, initialisation.scale_sigma)
         estimate = self.backend.estimate()
         timer.end("update")
-        self.monitor.update(frame.index, report, estimate)
+        self.monitor.update(frame.index, report, estimate, has_scale=self._has_scale(chosen))
         self._check_reading(output.observations)
         estimate = self._recovered(frame.index, self.monitor.judged(frame.index, estimate))
         timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
@@ -132,6 +132,12 @@ class FramePipeline:
             estimate,
             _frame_log(frame, timer.ms, output, selection, report, estimate),
         )
+
+    def _has_scale(self, seen: Observations) -> bool | None:
+        """Whether features that are used, or a motion sensor, measure lengths; None: none is seen."""
+        if self._motion is not None and self._imu.used:
+            return True
+        return bool(seen.has_right.any()) if len(seen) else None
 
     def _check_reading(self, seen: Observations) -> None:
         """Report that another reading of the calibration explains the rows, where one does."""

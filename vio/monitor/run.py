@@ -308,8 +308,13 @@ class RunMonitor:
         self._integrity.end_since(good_ns, "estimate-implausible", "scale-off")
         self._add([self._health.begun_anew(index, good_ns, estimate)])
 
-    def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
-        """Add the back end's report and estimate of a frame."""
+    def update(
+        self, index: int, report: UpdateReport, estimate: Estimate, *, has_scale: bool | None = True
+    ) -> None:
+        """Add the back end's report and estimate of a frame; `has_scale`: whether its features or a
+        motion sensor measure lengths, None: it shows nothing.
+        """
+        self._integrity.take_scale(measured=has_scale)
         self._add(self._health.frame(index, report, estimate))
         if self._contradiction is not None:
             self._add(self._contradiction.frame(index, report.innovation_ratio))
