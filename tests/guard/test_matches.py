@@ -234,6 +234,31 @@ def test_right_pixels_of_a_pair_that_shakes_count_less(degrees: float, named: bo
         assert np.all(sigma[:, :2] == 1.0)
 
 
+@pytest.mark.parametrize(("noise_px", "named"), [(0.1, True), (0.6, False)])
+def test_a_change_that_is_not_known_well_is_no_shake(noise_px: float, named: bool) -> None:
+    """Shaken by 0.03 degrees, 0.26 px, as 40 matches show."""
+    angles = 0.03 * np.random.default_rng(5).normal(size=FRAMES)
+
+    def shaken(
+        seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
+    ) -> Observations:
+        return turned(angles[k], (0.0, 1.0, 0.0))(seen, k, camera, period)
+
+    _, found = inspected(changed(shaken, flight(noise_px=noise_px, visible=0.1)))
+    assert codes(found) == (["right-camera-shakes"] if named else [])
+
+
+def test_a_camera_that_shakes_after_it_has_turned_is_still_turned() -> None:
+    rng = np.random.default_rng(5)
+    seen = flight()
+    for k in range(15, FRAMES):
+        degrees = 0.5 + (0.04 * rng.normal() if k > 17 else 0.0)
+        seen[k] = turned(degrees, (0.0, 1.0, 0.0))(seen, k, CAMERA, PERIOD)
+    out, found = inspected(seen)
+    assert codes(found) == ["right-contradicts-left", "right-camera-shakes"]
+    assert not any(record.has_right.any() for record in out[15:])
+
+
 @pytest.mark.parametrize("nearest_m", [3.0, 10.0, 19.0])
 def test_what_disparities_have_in_common_is_known_as_well_as_stated(nearest_m: float) -> None:
     """Of a camera that goes ahead, sideways and turns; depths that are more alike say less."""

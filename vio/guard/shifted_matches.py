@@ -44,6 +44,8 @@ class _ShiftRules(NamedTuple):
     # rig turns
     min_calm: int = 10
     clear_sigmas: float = 5.0  # of what they have in common
+    # of the size from which on a pair shakes: largest standard deviation of a change that tells
+    known_share: float = 0.5
     max_turn_rad: float = 0.1  # standard deviation of a rotation between two frames
     max_second_order: float = 0.005  # half of its square
     # frames that share too few with the last one that was compared, before another one counts as
@@ -87,13 +89,13 @@ class ShiftedMatches(MatchCheck):
             self._missed = 0
         if change is not None:
             self._take_jump(index, *change)
-        # one that is known less well than it would have to be says nothing of a pair that shakes
-        known = change is not None and change[1] < self._shake.limit_px
+        # one that is known less well says nothing of a pair that shakes
+        known = change is not None and change[1] < _SHIFT.known_share * self._shake.limit_px
         self._shake.frame(index, change[0] if change is not None and known else None, len(shared))
         self._found += self._shake.take_findings()
         factor = self._shake.right_factor
-        if factor > 1.0:
-            self._off_px = 0.0
+        if factor > 1.0 and abs(self._off_px) < _SHIFT.clear_sigmas * self._shake.sigma_px:
+            self._off_px = 0.0  # what jumped was a shake
         is_off = self._is_off
         # what jumps from frame to frame is no turn
         self._state.show(index, None if change is None or (is_off and not self._calm) else is_off)
