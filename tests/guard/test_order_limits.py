@@ -63,7 +63,7 @@ def _keeps_order(rows_px: float) -> bool:
     rng = np.random.default_rng(0)
     left = rng.uniform(50.0, 300.0, (60, 2))
     right = left - np.column_stack([rng.uniform(2.0, 20.0, 60), np.zeros(60)])
-    off = right + [0.0, rows_px]
+    off = right + np.array([0.0, rows_px])
     pairs = iter([[_points(left), _points(off)], [_points(left), _points(right)]])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
