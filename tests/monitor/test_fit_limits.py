@@ -441,6 +441,15 @@ def _is_still(gyro_radps: float = 0.0, accel_mps2: float = 0.0) -> bool:
     return bool(images._at_standstill())
 
 
+def _is_still_after(seconds: float) -> bool:
+    """Whether an IMU stands still that moved until some time ago."""
+    images = _frozen()
+    for k in range(201):
+        moves = k < 200 - 200 * seconds
+        images.samples([ImuSample(5_000_000 * k, np.full(3, 0.5 * moves * k % 0.7), np.zeros(3))])
+    return bool(images._at_standstill())
+
+
 REPEATED: dict[str, tuple[Says, float, float]] = {
     "corners": (lambda n: _unmoved_until(int(n)), 46, 50),
     "errors": (lambda n: not _remembers(int(n)), 19, 20),
@@ -448,6 +457,7 @@ REPEATED: dict[str, tuple[Says, float, float]] = {
     "crept": (_creeps, 0.043, 0.057),
     "crept: frames": (lambda n: _crept(int(n)), 2, 3),
     "begun": (_has_begun, 4.3, 5.7),
+    "standstill": (_is_still_after, 0.43, 0.57),
     "noise: gyro": (lambda x: not _is_still(gyro_radps=x), 7.0e-3, 9.6e-3),
     "noise: accelerometer": (lambda x: not _is_still(accel_mps2=x), 0.42, 0.58),
 }
