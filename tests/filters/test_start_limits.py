@@ -27,6 +27,7 @@ from vio.filters.step_by_images import explained_share, is_lost, linked_points, 
 from vio.filters.stereo_calibration import VerticalDisparityModel
 from vio.filters.track_records import Residuals, Views
 from vio.filters.vislam import Vislam
+from vio.filters.vislam_motion import DriftingTwist
 from vio.filters.window_fit import WindowFit
 from vio.filters.window_posterior import scale_sigma
 from vio.filters.window_tracks import WindowTracks
@@ -471,10 +472,10 @@ def _pose_updated(features: int) -> bool:
 def _start_gain(row: int, sigma: float) -> float:
     """How much of a velocity or rate of a standard deviation is believed at the start."""
     name = "linear_velocity_sigma_mps" if row < 3 else "angular_rate_sigma_radps"
-    vislam = _vislam(**{name: sigma})
-    vislam.propagate(VelocitySample(0, np.ones(3), np.ones(3)))
-    assert vislam._state.twist is not None
-    return float(vislam._state.twist[row])
+    motion = DriftingTwist(replace(VislamSettings(), **{name: sigma}))  # type: ignore[arg-type]
+    state = motion.take(motion.start(np.eye(4)), VelocitySample(0, np.ones(3), np.ones(3)))
+    assert state.twist is not None
+    return float(state.twist[row])
 
 
 VISLAM: dict[str, tuple[Says, float, float]] = {

@@ -16,14 +16,16 @@ from vio.filters import new_landmarks
 from vio.filters.imu_gaps import ImuHistory
 from vio.filters.imu_start import imu_start
 from vio.filters.mono_msckf import _for_one_camera
-from vio.filters.msckf import Msckf
 from vio.filters.multiview import residuals, robust_weights
 from vio.filters.new_landmarks import NewLandmarks
+from vio.filters.online_calibration import Calibration
+from vio.filters.propagation import Propagation
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.scale_test import ScaleTest
 from vio.filters.settings import MsckfSettings
 from vio.filters.step_by_images import linked_points, step_by_images
 from vio.filters.track_records import Residuals, Views
+from vio.filters.window import Window
 from vio.imu.settings import DEFAULT_IMU
 from vio.records import ImuSample
 
@@ -78,9 +80,11 @@ def _is_ahead(baselines: float) -> bool:
 def _is_predicted(seconds: float) -> bool:
     """Whether a frame is predicted that comes so long after the first, by images alone."""
     settings = replace(SETTINGS, angular_acceleration_density=1e-6)
-    msckf = Msckf(CAMERA, T_CAM0_IMU, settings, motion=None)
-    msckf.update(_seen_at(5.0, 40))
-    return msckf.predict(round(1e9 * seconds)) is not None
+    propagation = Propagation(None, settings, DEFAULT_IMU)
+    window = Window(propagation.motion, *propagation.motion.start(0), Calibration(T_CAM0_IMU))
+    propagation.begin(window, 0, 0)
+    window.add_clone(0, 0)
+    return propagation.predict(window, round(1e9 * seconds)) is not None
 
 
 def _rows_have_moved(px: float) -> bool:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from tests.frontend.test_frontend_scene import CAMERA
-from tests.frontend.test_limits import _found_delay
 from tests.frontend.test_new_limits import _tracks
 from vio.frontend import anchor_fit, flow, moving_object, outliers, right_alone, stereo_fit
 from vio.frontend.anchor_fit import AnchorFit
@@ -500,7 +499,6 @@ OTHERS: dict[str, tuple[Says, float, float]] = {
     "depth image: depth": (lambda x: _has_disparity(depth_m=x), 0.043, 0.057),
     "anchor: scale": (lambda x: _anchored(x)[0], 1.2, 1.3),
     "anchor: correlation": (lambda x: _anchored(score=x)[1], 0.45, 0.55),
-    "delay: sigmas": (lambda x: _found_delay(0.5, 10, 40, noise_px=x) == 0.0, 1.5, 2.0),
 }
 
 
@@ -615,6 +613,21 @@ def _right_tracks(count: int) -> Tracks:
     return changed(tracks, point=point, has_point=np.ones(count, np.bool_))
 
 
+def _is_static(off_px: float) -> bool:
+    """Whether a right match is taken that is off by so much from its depth."""
+    fit = _fit()
+    tracks = _right_tracks(30)
+    disparity = CAMERA.fu * CAMERA.baseline_m / tracks.point[:, 2]
+    pixels = tracks.left - np.column_stack([disparity, np.zeros(30)])
+    pixels[0, 0] -= off_px
+    good: list[FloatArray] = []
+    fit._fit = lambda *_: (pixels, np.zeros((30, 2, 2)), np.ones(30, np.bool_))
+    fit._with_right_pixels = lambda tracks, rows, pixels, skew, valid: good.append(valid)
+    nothing: Any = None
+    fit.track_right(tracks, nothing, True)
+    return bool(good[0][0])
+
+
 def _slope(spread_px: float) -> float:
     """How much disparities that are off by a tenth of them change with them."""
     expected = np.linspace(20.0, 20.0 + 2.0 * spread_px, 101)
@@ -710,6 +723,7 @@ RIGHT: dict[str, tuple[Says, float, float]] = {
     "largest reach": (lambda x: _largest_reach() < x, 0.56, 0.72),
     "depths by motion": (lambda x: not _agrees_by_motion(x), 2.6, 3.4),
     "spread": (lambda x: _slope(x) != 0.0, 1.7, 2.3),
+    "match: depth": (lambda x: not _is_static(x), 0.87, 1.13),
     "common: matches": (lambda n: _common(int(n)) is not None, 19, 20),
     "few matches": (_has_many, 0.17, 0.23),
     "rows are off": (lambda x: _row_model(x).are_off, 0.17, 0.23),
