@@ -28,6 +28,7 @@ from vio.guard.displaced_matches import DisplacedMatches
 from vio.guard.exchanged_matches import ExchangedMatches
 from vio.guard.frozen_matches import FrozenMatches
 from vio.guard.guarded import _few_matches
+from vio.guard.image_change import image_change
 from vio.guard.late_matches import LateMatches
 from vio.guard.match_check import SharedMatches
 from vio.guard.object_matches import ObjectMatches
@@ -79,12 +80,22 @@ def _fine_contrast() -> float:
     return float(exchange._thumbnail((128.0 + 50.0 * signs).astype(np.uint8)).std())
 
 
+def _is_clipped(level: int) -> bool:
+    """Whether pixels are left out of a comparison that are so bright."""
+    image = _grays(20.0)
+    image[:60] = level
+    other = image.copy()
+    other[:60] = level - 30
+    return image_change(image, other) < 1e-9
+
+
 ORDERS: dict[str, tuple[Says, float, float]] = {
     "points": (lambda n: _ordered(int(n)), 19, 20),
     # correlations of 0.21 and 0.19
     "correlation": (lambda m: not _ordered(400, int(m)), 250, 257),
     "sigmas": (lambda m: not _ordered(20, int(m)), 11, 12),
     "rows": (lambda x: not _keeps_order(x), 1.3, 1.7),
+    "clipped": (lambda n: _is_clipped(int(n)), 248, 252),
     "thumbnail": (lambda x: _fine_contrast() < x, 5.2, 6.7),
 }
 
