@@ -221,6 +221,7 @@ OTHERS: dict[str, tuple[Says, float, float]] = {
     "late: whole frames": (lambda x: _found_delay(1.0 - x) != 1.0, 0.13, 0.17),
     "late: explained": (lambda x: _found_delay(0.5, 300, 900, x) == 0.0, 10.0, 13.0),
     "late: forgotten": (lambda x: _found_delay(0.5, then=x) != 0.0, 0.085, 0.115),
+    "late: sigmas": (lambda x: _found_delay(0.5, 10, 40, noise_px=x) == 0.0, 1.5, 2.0),
     "gap: seconds": (lambda x: is_long_gap(round(1e9 * x), 10_000_000), 0.72, 0.88),
     "gap: steps": (lambda x: is_long_gap(round(4e8 * x), 400_000_000), 4.5, 5.5),
     "gap: contradicts the gyro": (_contradicts, 1.2, 1.45),

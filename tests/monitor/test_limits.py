@@ -271,7 +271,7 @@ READINGS: dict[str, tuple[Says, float, float]] = {
     "clipped: levels": (lambda n: _clipped(8, int(n)), 21, 28),
     "clipped: chance": (lambda n: _clipped(int(n), share_held=0.5), 20, 35),
     "size: time": (_size_kind, 0.9, 1.1),
-    "size: averaged": (_averaged, 0.2, 0.6),
+    "size: averaged": (_averaged, 0.2, 0.33),
 }
 
 

@@ -52,7 +52,6 @@ MIN_TURN_DEG = 0.2
 # degrees in all rows of KITTI
 MIN_ROW_YAW_DEG = 0.9
 _SHARED = 10  # unknowns of two pairs: rotation, p2, and the motion's rotation and translation
-_PIXELS = 8  # of a point in two pairs
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,7 +249,7 @@ class _SeenTwice:
         A = np.moveaxis(by_shared - r, 0, -1) / h
         by_point = self.residuals(shared, points + h * np.eye(3)[:, None])
         B = np.moveaxis(by_point - r, 0, -1) / h
-        squared = (r * r).sum(axis=1) / (_PIXELS * sigma**2)
+        squared = (r * r).mean(axis=1) / sigma**2
         weights = 1.0 / (1.0 + squared) / sigma**2
         Aw = A * weights[:, None, None]
         Bw = B * weights[:, None, None]

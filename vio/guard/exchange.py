@@ -21,6 +21,7 @@ from vio.findings import Finding
 from vio.guard.image_change import image_change
 from vio.guard.image_check import FrameImages, ImageCheck
 from vio.guard.probe import RowProbe
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 
 Order: TypeAlias = Literal["given", "exchanged", "refused"]
@@ -33,7 +34,7 @@ class _ExchangeRules:
     # width and height, so coarse that a shift of the image by some pixels changes little
     thumbnail: tuple[int, int] = (48, 30)
     # averaged first: OpenCV averages whole pixels five times as fast as fractions of them
-    block_px: int = 4
+    block_px: Capacity[int] = 4
     min_points: int = 20
     exchanged_share: float = (
         0.4  # share of points with a negative disparity that proves an exchange

@@ -52,7 +52,7 @@ class _TurnedRules(NamedTuple):
     min_flow_px: float = 2.0  # of features in the mean, between frames that tell it …
     max_still: int = 40  # … and frames with less of it after which none is waited for
     max_contradicting: int = 20  # frames after which images are turned back to no avail
-    max_wait: int = 20  # frames that have not moved since the last pair, before one is taken
+    max_wait: int = 20  # frames that have not moved, in all, after which each is taken
 
 
 _TURNED = _TurnedRules()

@@ -23,6 +23,7 @@ from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, lengths, se3_log
 from vio.imu.standstill import STANDSTILL_S, blocks_agree
 from vio.numerics.compiled import compiled
+from vio.numerics.kinds import Capacity
 from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import (
@@ -58,7 +59,7 @@ class _FlowRules(NamedTuple):
     max_crept: int = 2  # … of whose equal frames in a row so many are left out
     unmoved_px: float = 0.15  # the flow of an unmoved corner under noise of a few gray levels
     unmoved_share: float = 0.8  # of the corners that must be unmoved
-    first_rows: int = 8  # compared before all others
+    first_rows: Capacity[int] = 8  # compared before all others
 
 
 _FLOW = _FlowRules()

@@ -12,12 +12,13 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.imu.findings import InertialFinding
+from vio.imu.two_sensors import GAPS
 from vio.numerics.kinds import Capacity
 from vio.numerics.robust import median, robust_sigma
 from vio.records import S_PER_NS, BoolArray, ImuSample, IntArray
 
-GAP_S = 0.1  # readings further apart are a gap …
-GAP_STEPS = 8.0  # … if that is so many times their usual interval
+GAP_S = GAPS.min_ns * S_PER_NS  # readings further apart are a gap …
+GAP_STEPS = GAPS.usual_intervals  # … if that is so many times their usual interval
 MEMORY_S: Capacity[float] = 60.0  # older readings and motions are dropped
 
 
