@@ -13,8 +13,8 @@ import pytest
 
 from vio.calibration.findings import NotObservable
 from vio.calibration.stereo import RowResiduals
-from vio.inspection.inertial import noise_part, still_windows
 from vio.inspection import inspect, pictures
+from vio.inspection.inertial import noise_part, still_windows
 from vio.inspection.inspect import clock_facts, clock_part
 from vio.inspection.pictures import _is_distinct, _rows_faults, depths_part, images_part
 from vio.records import Image, ImuDensities, ImuRecord, StereoFrame
@@ -112,8 +112,7 @@ def _matching(rows_px: float) -> int:
     disparities = rng.uniform(2.0, 40.0, 200)
     left = [cv2.KeyPoint(float(x), float(y), 1.0) for x, y in zip(u, v, strict=True)]
     right = [
-        cv2.KeyPoint(float(x), float(y), 1.0)
-        for x, y in zip(u - disparities, v + off, strict=True)
+        cv2.KeyPoint(float(x), float(y), 1.0) for x, y in zip(u - disparities, v + off, strict=True)
     ]
     with patch.object(pictures, "sift_points", lambda a, b: list(zip(left, right, strict=True))):
         return len(pictures.sift_pairs(np.zeros((1, 1), np.uint8), np.zeros((1, 1), np.uint8)))
@@ -127,7 +126,14 @@ class _Read:
         self.single: set[int] = set()
         self.several: set[int] = set()
         camera = SimpleNamespace(
-            kind="mono", width=None, height=None, fu=1.0, fv=1.0, cu=0.0, cv=0.0, baseline_fault=None
+            kind="mono",
+            width=None,
+            height=None,
+            fu=1.0,
+            fv=1.0,
+            cu=0.0,
+            cv=0.0,
+            baseline_fault=None,
         )
         self.recording: Any = SimpleNamespace(
             frame_times_ns=step_ns * np.arange(frames),
