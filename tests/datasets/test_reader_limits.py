@@ -29,7 +29,9 @@ from vio.datasets import (
     videos,
     yaml_files,
 )
+from vio.datasets.bags.clock_steps import mended
 from vio.datasets.bags.index import _split_mixed
+from vio.datasets.bags.storage_order import _goes_back
 from vio.datasets.bags.store import Topic
 from vio.datasets.bags.topics import _one_camera
 from vio.datasets.companions import imu_on_camera_clock
@@ -157,6 +159,17 @@ def _raw_images_are_taken(share: float) -> bool:
     raw = Topic("/left", "sensor_msgs/msg/Image", round(1000 * share))
     compressed = Topic("/left/compressed", "sensor_msgs/msg/CompressedImage", 1000)
     return _one_camera([raw, compressed])[0] == raw
+
+
+def _clock_is_set(back_ms: float = 0.0, ahead_ms: float = 0.0, topics: int = 2) -> bool:
+    """Whether a clock is mended that was set while topics with a message a millisecond were
+    recorded.
+    """
+    logged = MS * np.arange(2000)
+    stamps = logged.copy()
+    stamps[1000:] += round(MS * (ahead_ms - back_ms))
+    streams = {str(k): (stamps, logged) for k in range(topics)}
+    return bool(mended(streams)[1])
 
 
 def _is_gravity_of_gyro(norm: float) -> bool:
@@ -396,6 +409,14 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "bag: one of two sensors": (lambda x: _is_split(x, 0.98 - x), 0.09, 0.11),
     "bag: both sensors": (lambda x: _is_split(0.5 * x, 0.5 * x), 0.88, 0.92),
     "bag: raw images": (_raw_images_are_taken, 0.88, 0.92),
+    "bag: set back": (lambda x: _clock_is_set(back_ms=x), 9.0, 11.0),
+    "bag: set forward": (lambda x: _clock_is_set(ahead_ms=x), 95.0, 105.0),
+    "bag: streams": (lambda n: _clock_is_set(ahead_ms=500.0, topics=int(n)), 1, 2),
+    "bag: disorder": (
+        lambda x: _goes_back([0, 1000 * MS, round(MS * (1000 - x))]),
+        9.0,
+        11.0,
+    ),
     "arrays": (
         lambda x: _is_refused(lambda: common.check_array_bytes({"a": round(x)}, Path("a"))),
         1.9 * 2**30,

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock, patch
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,7 +18,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.mapping import builder, place_finder
 from vio.mapping import session as sessions
 from vio.mapping.builder import MapBuilder, agree
-from vio.mapping.features import DESCRIPTOR_BYTES
+from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures, _equal_contrast, extract
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import MapStore
 from vio.mapping.place_finder import FoundPlace, PlaceFinder
@@ -99,6 +100,44 @@ def _frames_until(event: str) -> int:
             return int(held.due - 100)
         MapSession._hand_over(own, held)
     return int(own._waiting[0][0] - 100)
+
+
+# Key points
+
+
+def _texture(contrast: float = 60.0, shift_px: int = 0) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """An image of blobs of several sizes, moved to the left by some pixels."""
+    rng = np.random.default_rng(0)
+    total = np.zeros((360, 960))
+    for size in (1, 2, 4, 8, 16):
+        small = rng.normal(size=(360 // size, 960 // size))
+        total += cv2.resize(small, (960, 360), interpolation=cv2.INTER_CUBIC)
+    total *= contrast / total.std()
+    moved = total[:, shift_px : shift_px + 480]
+    return np.clip(np.round(128.0 + moved), 0, 255).astype(np.uint8)
+
+
+def _extracted(shift_px: int = 10, rows_px: int = 0) -> KeyframeFeatures:
+    right = np.roll(_texture(shift_px=shift_px), rows_px, axis=0)
+    return extract(_texture(), right)
+
+
+def _contrast_left(deviation: float) -> float:
+    """Of a chequered image with such a standard deviation, after its contrast was made equal."""
+    signs = np.where(np.indices((60, 60)).sum(axis=0) % 2, 1.0, -1.0)
+    image = np.round(120.0 + deviation * signs).astype(np.uint8)
+    return float(_equal_contrast(image)[20:40, 20:40].std())
+
+
+def _brightness() -> float:
+    return float(_equal_contrast(np.full((60, 60), 90, np.uint8)).mean())
+
+
+def _reach_of_step() -> int:
+    """How many columns beside a step of brightness it changes."""
+    image = np.full((40, 80), 90, np.uint8)
+    image[:, 40:] = 150
+    return int((_equal_contrast(image)[20] != 128).sum())
 
 
 # Places
@@ -265,6 +304,23 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "motion: angle": (lambda x: bool(_sigmas(_moved(0.0, 1.0), 0.0)[3] < 1e-4 * x), 1.8, 2.2),
     "frames: settled": (lambda n: _frames_until("settled") < n, 3, 4),
     "frames: taken over": (lambda n: _frames_until("taken over") < n, 10, 11),
+    "points: most": (lambda n: len(_extracted()) < n, 600, 601),
+    "points: scale": (lambda x: float(_extracted().sigma_px.max()) < x, 3.5, 3.7),
+    "points: disparity": (
+        lambda n: _extracted(int(n)).has_right.mean() < 0.1,
+        180,
+        204,
+    ),
+    "points: rows": (lambda n: _extracted(rows_px=int(n)).has_right.mean() < 0.3, 1, 3),
+    "points: brightness": (lambda x: _brightness() < x, 127.0, 129.0),
+    "points: strong contrast": (lambda x: _contrast_left(100.0) < x, 35.0, 40.0),
+    "points: weak contrast": (lambda x: _contrast_left(6.0) < x, 18.5, 21.5),
+    "points: corners": (
+        lambda x: len(extract(_texture(x), _texture(x))) > 100,
+        3.0,
+        4.0,
+    ),
+    "points: step": (lambda n: _reach_of_step() < n, 14, 15),
     "place: recent": (lambda n: _is_looked_for(int(n)), 9, 10),
     "place: path": (lambda x: _is_looked_for(passed=x), 1.4, 1.6),
     "place: view": (lambda x: not _is_looked_for(apart=x), 1.4, 1.6),

@@ -12,14 +12,17 @@ import numpy as np
 import pytest
 
 from tests.offline.test_limits import _run
+from vio.dense import preview
 from vio.dense.occupancy import occupancy_grid
 from vio.dense.stereo_depth import StereoMatcher, depth_sigma_m
 from vio.dense.surface import Mesh
+from vio.errors import EstimationError
 from vio.files.meshes import OCCUPIED
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.stereo import StereoCamera
-from vio.offline import refine, verdict
+from vio.offline import refine, self_calibration, verdict
 from vio.offline.check import expected_minutes
+from vio.offline.colmap.model import ModelImages
 from vio.offline.comparison import _expected_end, _longest_piece
 from vio.offline.georeference import _is_one_path
 from vio.offline.inertial_refinement import inertial_keyframes
@@ -114,7 +117,107 @@ def _minutes_of_measured(mappers: int) -> float:
     return expected_minutes(30, names) / (measured_s / 60)
 
 
+# COLMAP
+
+
+def _reconstruction() -> Any:
+    return pytest.importorskip("vio.offline.colmap.reconstruction", exc_type=ImportError)
+
+
+def _is_matched_with(count: int, first: str, second: str) -> bool:
+    """Whether images of a rig's keyframes are matched; one loop joins keyframes 10 and 100."""
+    names = ModelImages(tuple(f"l{k}" for k in range(count)), tuple(f"r{k}" for k in range(count)))
+    pairs = _reconstruction().pairs_to_match(names, np.array([[10, 100]]))
+    return (first, second) in pairs
+
+
+def _is_linked(apart: int = 1, points: int = 100) -> bool:
+    shared = np.full((2, 2), points)
+    return bool(_reconstruction().linked_steps(shared, np.array([0, apart]))[0])
+
+
+# Self-calibration
+
+
+def _known() -> self_calibration.SelfCalibration:
+    """A calibration that is known but for what lens models leave."""
+    size = len(self_calibration.NAMES)
+    none = np.zeros(size)
+    return self_calibration.SelfCalibration(none, none, np.zeros((size, size)), 1, 9, 0.1)
+
+
+def _disparity_sigma_deg() -> float:
+    sigma = _known().disparity_off(CAMERA, 10.0)[1]
+    return float(np.degrees(sigma / CAMERA.fu))
+
+
+def _is_observable(residual_px: float) -> bool:
+    segment: Any = SimpleNamespace(tracks=SimpleNamespace(ids=[1]))
+    with (
+        patch.object(self_calibration, "_optimum", lambda camera, x, pieces, width: (x, pieces)),
+        patch.object(self_calibration, "_spread", lambda *_: residual_px),
+        patch.object(self_calibration, "_without_outliers", lambda camera, x, piece, sigma: piece),
+        patch.object(self_calibration, "_with_covariance", lambda *_: None),
+    ):
+        try:
+            self_calibration.self_calibrate(CAMERA, [segment], intrinsics=False)
+        except EstimationError:
+            return False
+    return True
+
+
+def _counts(sigmas: float) -> float:
+    """What a residual adds to the cost for its square, over a small one."""
+
+    def cost(r: float) -> float:
+        rows = (np.full((1, 4), r),)
+        piece: Any = None
+        with patch.object(self_calibration, "_residuals", lambda *_: rows):
+            return self_calibration._cost(CAMERA, 1.0, np.ones(18), (np.zeros(18), [piece]))
+
+    step = 1e-3
+    slope = (cost(sigmas + step) - cost(sigmas)) / ((sigmas + step) ** 2 - sigmas**2)
+    return float(slope / (cost(step) / step**2))
+
+
+def _is_kept(sigmas: float) -> bool:
+    rows = (np.array([[sigmas, 0.0, 0.0, 0.0]]),) * 3
+    kept: list[Any] = []
+    piece: Any = SimpleNamespace(tracks=None)
+    with (
+        patch.object(self_calibration, "_residuals", lambda *_: rows),
+        patch.object(
+            self_calibration,
+            "keep_rows",
+            lambda tracks, good: kept.append(good) or SimpleNamespace(ids=[]),
+        ),
+    ):
+        self_calibration._without_outliers(CAMERA, np.zeros(18), piece, 1.0)
+    return bool(kept[0].any())
+
+
 # Surfaces
+
+
+def _picture_of_points() -> np.ndarray[Any, Any]:
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    return preview._splat(points, np.zeros((500, 3)), np.full(500, 0.01), 1)
+
+
+def _looks_down_deg() -> float:
+    return float(np.degrees(np.arcsin(-preview._view(np.array([0.0, 1.0]))[2, 2])))
+
+
+def _looks_aside_deg() -> float:
+    """Of a path that leads ahead."""
+    right = preview._view(np.array([0.0, 1.0]))[0]
+    return float(np.degrees(np.arccos(right[0])))
+
+
+def test_a_picture_of_a_surface_has_the_size_that_is_stated() -> None:
+    image = _picture_of_points()
+    assert str(image.shape) in str(preview.preview.__doc__)
+    assert image.max() > 230
 
 
 def _plan(points: FloatArray) -> FloatArray:
@@ -171,6 +274,23 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "map: motion": (lambda x: not _is_one(x), 0.045, 0.055),
     "map: share of a motion": (lambda x: not _is_one(x, 10.0), 1.0, 1.1),
     "refined: apart": (_warns, 2.8, 3.2),
+    "COLMAP: all": (lambda n: not _is_matched_with(int(n), "l0", f"l{int(n) - 1}"), 60, 61),
+    "COLMAP: next": (lambda n: not _is_matched_with(200, "l0", f"l{int(n)}"), 16, 17),
+    "COLMAP: across": (lambda n: not _is_matched_with(200, "r0", f"l{int(n)}"), 1, 2),
+    "COLMAP: loops": (
+        lambda n: not _is_matched_with(200, f"l{10 + int(n)}", f"l{100 - int(n)}"),
+        1,
+        2,
+    ),
+    "COLMAP: linked": (lambda n: not _is_linked(int(n)), 6, 7),
+    "COLMAP: shared": (lambda n: _is_linked(points=int(n)), 14, 15),
+    "rig: lens": (lambda x: _disparity_sigma_deg() < x, 0.009, 0.011),
+    "rig: direction": (lambda x: _known().right_camera()[3] < x, 0.28, 0.32),
+    "rig: residual": (lambda x: not _is_observable(x), 1.4, 1.6),
+    "rig: half": (lambda x: _counts(x) < 0.5, 1.9, 2.1),
+    "rig: outlier": (lambda x: not _is_kept(x), 4.8, 5.2),
+    "picture: down": (lambda x: _looks_down_deg() < x, 36.0, 44.0),
+    "picture: aside": (lambda x: _looks_aside_deg() < x, 55.0, 65.0),
     "plan: step": (_is_obstacle, 0.18, 0.22),
     "plan: clearance": (lambda x: not _is_obstacle(x), 1.9, 2.1),
     "plan: vertices": (lambda n: _is_obstacle(1.0, int(n)), 1, 2),
