@@ -15,10 +15,12 @@ import pytest
 
 from vio.geometry.lie import FloatArray, so3_exp
 from vio.geometry.relative_pose import RelativePose
+from vio.geometry.stereo import StereoCamera
 from vio.mapping import builder, place_finder
 from vio.mapping import session as sessions
 from vio.mapping.builder import MapBuilder, agree
 from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures, _equal_contrast, extract
+from vio.mapping.guided_search import _corners, _in_reach, _weakened
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import MapStore
 from vio.mapping.place_finder import FoundPlace, PlaceFinder
@@ -207,6 +209,26 @@ def _expected(score: float, row: int = 1, places: int = 1) -> int:
     return len(PlaceFinder._expected_places(own, 0, np.arange(count)))
 
 
+def _corner_px() -> float:
+    """How far apart features are that count as two, along a row."""
+    z = np.zeros((8000, 4))
+    z[:, 0] = 0.1 * np.arange(8000)
+    return 800.0 / _corners(z)
+
+
+def _prior_variance() -> float:
+    weak = _weakened(MOTION)
+    assert weak is not None
+    return float(weak.covariance[0, 0])
+
+
+def _may_show(beside_px: float) -> bool:
+    """Whether a point is looked for that is so far outside of the image."""
+    camera = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
+    place: Any = SimpleNamespace(p=np.array([[-(320.0 + beside_px) / 400.0, 0.0, 1.0]]))
+    return len(_in_reach(place, camera, np.eye(4))) > 0
+
+
 # Loops
 
 
@@ -339,6 +361,9 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "searched: neighbours": (lambda x: _expected(x, row=7) > 0, 1.65, 1.75),
     "searched: neighbours, many": (lambda x: _expected(x, row=20) > 0, 1.65, 1.75),
     "searched: corners": (lambda x: _expected(x) > 0, 11.5, 12.5),
+    "searched: corner": (lambda x: _corner_px() < x, 7.5, 8.5),
+    "searched: prior": (lambda x: _prior_variance() < x, 9.0, 11.0),
+    "searched: beside the image": (lambda x: not _may_show(x), 62.0, 68.0),
     "loop: within": (lambda n: not _is_confirmed(int(n)), 6, 7),
     "loop: neighbours": (lambda x: not _agree(x), 48.0, 52.0),
     "loop: error": (_optimises, 5.5, 6.5),
