@@ -489,5 +489,6 @@ def test_levels_are_those_of_the_fewest_bits_that_hold_the_images(bits: int) -> 
 
 def test_16_bits_are_scaled_to_8() -> None:
     highest = np.iinfo(np.uint16).max
-    assert to_8_bits(np.array([[0, highest]], np.uint16), FULL_SCALE).tolist() == [[0, 255]]
+    pixels = np.array([[0, highest // 2, highest]], np.uint16)
+    assert to_8_bits(pixels, FULL_SCALE).tolist() == [[0, 127, 255]]
     assert levels_of([(0.0, float(highest))]) == FULL_SCALE

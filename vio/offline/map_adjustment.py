@@ -29,9 +29,8 @@ from vio.records import IntArray, MapKeyframes, feature_tracks
 from vio.runs.mapped import MappedRun, corrected
 from vio.runs.pipeline import RunResult
 
-MAX_KEYFRAMES: Capacity[int] = (
-    1500  # of the adjustment, four a second: its time and memory grow with them
-)
+# of the adjustment, four a second: its time and memory grow with them
+MAX_KEYFRAMES: Capacity[int] = 1500
 _MAX_SIGMAS = 3.0  # by which it may move the map, by the map's covariance
 
 
