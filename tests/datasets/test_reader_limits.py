@@ -446,7 +446,7 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "Kalibr: shift": (lambda x: _apart(_moved(x), np.eye(4)), 1.9e-3, 2.1e-3),
     "Kalibr: turn": (lambda x: _apart(_moved(0.0, x), np.eye(4)), 4.8e-3, 5.2e-3),
     "OAK: scaled": (lambda x: not _oak_is_scaled(x), 0.009, 0.011),
-    "OpenCV: long names": (lambda n: _name_is_found(["dist1", "LEFT.d"][int(n)]), 0, 1),
+    "OpenCV: long names": (lambda n: _name_is_found(["dist1", "D_left"][int(n)]), 0, 1),
     "levels: bright pixels": (lambda x: _levels_of_bright(x) > 1023, 0.0008, 0.0012),
     "mosaic": (_mosaic, 1.15, 1.25),
     "EXIF": (lambda n: not _exif_is_found(int(n)), 4080, 4110),
