@@ -23,7 +23,6 @@ import numpy as np
 import pytest
 
 import vio
-from tests.replaced_rules import replaced
 from tests.same_events import frames_of
 from vio.cameras.rig import Rig
 from vio.cli import main
@@ -458,9 +457,12 @@ class _OakDevice:
         return self
 
     def requestOutput(self, size: Any, *, type: Any, fps: float) -> Any:
+        assert size in {(640, 400), (1280, 720), (1280, 800)}  # of its OV9282
+        self.step_us = round(1e6 / fps)
         return self
 
     def enableIMUSensor(self, sensors: list[int], rate: int) -> None:
+        assert rate in {25, 50, 100, 200, 400}  # of its BMI270
         self.socket = "imu"
 
     def setBatchReportThreshold(self, count: int) -> None: ...
@@ -471,7 +473,7 @@ class _OakDevice:
         if self.socket == "imu":
             return _OakQueue([SimpleNamespace(packets=[_oak_packet(k) for k in range(10)])])
         value = 1 if self.socket == "left" else 2
-        return _OakQueue(*([_oak_image(k, value + k)] for k in range(2)))
+        return _OakQueue(*([_oak_image(k * self.step_us, value + k)] for k in range(2)))
 
     def readCalibration(self) -> Any:
         return self
@@ -514,8 +516,8 @@ def _oak_packet(k: int) -> Any:
     return SimpleNamespace(acceleroMeter=read, gyroscope=read)
 
 
-def _oak_image(k: int, value: int) -> Any:
-    stamp = timedelta(seconds=1, microseconds=50_000 * k)
+def _oak_image(after_us: int, value: int) -> Any:
+    stamp = timedelta(seconds=1, microseconds=after_us)
     image = np.full((400, 640), value, dtype=np.uint8)
     return SimpleNamespace(getCvFrame=lambda: image, getTimestampDevice=lambda: stamp)
 
@@ -526,7 +528,7 @@ def test_an_oak_gives_pairs_samples_and_calibration_in_metres(
     """Against a stand-in: no device was at hand."""
     device = _OakDevice()
     monkeypatch.setitem(sys.modules, "depthai", device)  # type: ignore[arg-type]
-    monkeypatch.setattr("vio.sources.oak._WAITS", replaced("vio.sources.oak._WAITS", lost_s=0.0))
+    monkeypatch.setattr("vio.sources.oak.LOST_S", 0.0)
     source = open_source("oak:14442C")
     events: list[SourceEvent] = []
     with pytest.raises(DataError, match="nothing for 0 s"):

@@ -5,15 +5,21 @@ tenth or two of what it is made to be.
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_log
+from vio.sim import glare
 from vio.sim.effects import SensorEffects
+from vio.sim.export import _levels
 from vio.sim.exposure import _control
 from vio.sim.glare import _ghosts, _halo
 from vio.sim.lighting import Light, Lighting, illumination
+from vio.sim.motion import _limit, _ramped_time, car_loop, motion_at
 from vio.sim.people import Walk, _clearance, along_walks, walking_people
 
 MS = 1_000_000
@@ -146,6 +152,79 @@ def _shortest_ms() -> float:
     return float(shutter.min())
 
 
+def _gains(seed: int) -> FloatArray:
+    """All gains of a camera, which it takes where scenes are the darker."""
+    effects = SensorEffects(auto_exposure=True, gain_max=8.0)
+    dark = [np.full((1, 4), 95.0 * 2.0 ** (-0.2 * k)) for k in range(80)]
+    return np.unique([_control(radiance, effects, 0, seed)[1][0] for radiance in dark])
+
+
+def _gain_step() -> float:
+    gains = _gains(3)
+    return float((gains[-1] / gains[0]) ** (1 / (len(gains) - 1)))
+
+
+def _gain_error() -> float:
+    dark = np.full((1, 4), 1e-3)
+    effects = SensorEffects(auto_exposure=True, gain_max=8.0)
+    gains = [_control(dark, effects, 0, seed)[1][0] for seed in range(300)]
+    return float(np.std(gains) / 8.0)
+
+
+# What is seen of a source
+
+
+def _source(distance_m: float, light: Light = WINDOW) -> tuple[FloatArray, float]:
+    """Points of a source that are visible where the ray to each meets something so far away, and
+    their light over the source's.
+    """
+    pose = np.eye(4)
+    pose[2, 3] = 10.0
+    view: Any = SimpleNamespace(T_world_cam=pose)
+    met = SimpleNamespace(found=np.ones(9, np.bool_), distance=np.full(9, distance_m))
+    if light.distant:
+        met = SimpleNamespace(found=np.ones(1, np.bool_), distance=np.full(1, distance_m))
+    surfaces: Any = None
+    with patch.object(glare, "cast", lambda *_: met):
+        return glare._sources(light, view, surfaces)
+
+
+def _sky_m() -> float:
+    """How far away something is at least that is taken for the sky."""
+    return float(min(m for m in range(50, 200) if len(_source(m, SUN)[0])))
+
+
+# Motion and depth images
+
+
+def _car_speeds() -> FloatArray:
+    motion = car_loop()
+    times = np.arange(motion.start_ns, motion.end_ns, 50 * MS)
+    return np.asarray(np.linalg.norm(motion_at(motion, times).velocity_world, axis=1))
+
+
+def _half_way_s() -> float:
+    """When a rig that begins to move has half of its speed."""
+    t = np.linspace(0.0, 5.0, 5001)
+    return float(t[np.searchsorted(np.gradient(_ramped_time(t), t), 0.5)])
+
+
+def _outlying() -> float:
+    """Residuals that are no noise, in standard deviations."""
+    kept = np.abs(np.random.default_rng(0).normal(size=100_000))
+    return _limit(kept, 0.0)
+
+
+def _depths(z: float) -> FloatArray:
+    levels = _levels(np.full((100, 100), z), np.random.default_rng(0))
+    return np.asarray(levels / 5000.0)
+
+
+def _depth_ends() -> FloatArray:
+    known = [z for z in np.arange(0.1, 20.0, 0.05) if (_depths(z) > 0).all()]
+    return np.array([known[0], known[-1]])
+
+
 FIGURES: dict[str, tuple[Callable[[], float], float, float]] = {
     "people: steps": (_steps_per_s, 1.5, 2.1),
     "people: pause": (_pause_s, 1.0, 1.45),
@@ -174,6 +253,23 @@ FIGURES: dict[str, tuple[Callable[[], float], float, float]] = {
     "exposure: every": (lambda: float(np.diff(_changes()).min()), 3.0, 3.0),
     "exposure: largest change": (_largest_change, 0.52, 0.68),
     "exposure: share of the error": (_share_of_error, 0.52, 0.68),
+    "exposure: gain step": (_gain_step, 1.3, 1.55),
+    "exposure: gain error": (_gain_error, 0.042, 0.06),
+    "window: light": (lambda: 9 * _source(10.0)[1], 0.17, 0.23),
+    "sun: light": (lambda: _source(1e3, SUN)[1], 0.021, 0.029),
+    "sun: sky": (_sky_m, 90.0, 110.0),
+    "car: speed": (lambda: float(_car_speeds().max()), 9.0, 11.0),
+    "car: acceleration": (
+        lambda: float(np.abs(np.diff(_car_speeds()) / 0.05).max()),
+        1.5,
+        2.2,
+    ),
+    "rig: begins": (_half_way_s, 0.85, 1.15),
+    "poses: outlying": (_outlying, 4.5, 5.5),
+    "depth: noise": (lambda: float(_depths(4.0).std()), 0.021, 0.027),
+    "depth: level": (lambda: float(_depths(2.0).mean()), 1.9, 2.1),
+    "depth: nearest": (lambda: float(_depth_ends()[0]), 0.35, 0.5),
+    "depth: farthest": (lambda: float(_depth_ends()[1]), 7.0, 9.0),
     "exposure: shortest": (_shortest_ms, 0.017, 0.023),
 }
 

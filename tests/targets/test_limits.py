@@ -24,6 +24,7 @@ def _enough(
     scales: float = 2.0,
     turn_radps: float = 1.0,
     seconds: float = 40.0,
+    tilt_deg: float = 25.0,
 ) -> bool:
     """Whether nothing is missing of a recording that has enough, but for one thing."""
     guidance = Guidance(GRID)
@@ -31,7 +32,9 @@ def _enough(
     guidance._views = [(seen,)] * views
     guidance._sizes = [(752, 480)]
     guidance._cells = [np.full(9, cell_corners)]
-    tilts = [[sign * 25.0 * (axis == k) for axis in range(2)] for k in range(2) for sign in (1, -1)]
+    tilts = [
+        [sign * tilt_deg * (axis == k) for axis in range(2)] for k in range(2) for sign in (1, -1)
+    ]
     guidance._tilts_deg = [np.array(tilt) for tilt in tilts for _ in range(tilted)]
     guidance._scales = [100.0, 100.0 * scales]
     for k in range(round(20 * seconds) + 1):
@@ -59,6 +62,7 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "views": (lambda n: _enough(int(n)), 29, 30),
     "corners of a part": (lambda n: _enough(cell_corners=n), 11, 12),
     "tilts": (lambda n: _enough(tilted=int(n)), 2, 3),
+    "tilted": (lambda x: _enough(tilt_deg=x), 14.5, 15.5),
     "distances": (lambda x: _enough(scales=x), 1.5, 1.7),
     "turns": (lambda x: _enough(turn_radps=x), 0.37, 0.43),
     "time": (lambda x: _enough(seconds=x), 29.0, 31.0),

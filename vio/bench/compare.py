@@ -40,7 +40,7 @@ _NOT_JUDGED = ("ate_sim3_m", "refused_share", "cpu_ms", "memory_mib")
 _MIN_CHANGE = 0.01  # a mean change below is none, however certain
 # Below this, in the unit of the figure, two values are the same: ATE of 0.01 mm is that of a
 # recording at rest.
-_FLOOR = 1e-5
+FLOOR = 1e-5
 
 _RunKey: TypeAlias = tuple[str, str, int]  # sequence, system, seed
 _Pair: TypeAlias = tuple[Outcome, Outcome]
@@ -296,7 +296,7 @@ def _cases(
         y = new.value(metric)
         if x is not None and y is not None:
             case = (old.sequence, old.seed) if old.sequence in drawn_each_seed else old.sequence
-            found.setdefault(case, set()).add((max(x, _FLOOR), max(y, _FLOOR)))
+            found.setdefault(case, set()).add((max(x, FLOOR), max(y, FLOOR)))
     return {case: [math.log(y / x) for x, y in sorted(values)] for case, values in found.items()}
 
 

@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from vio.bench.compare import FLOOR
 from vio.bench.tables import METRICS, Outcome, number
 from vio.errors import EvaluationError
+from vio.numerics.kinds import Capacity
 
 _ATE = METRICS[0]
-_FLOOR_M = 1e-5  # below it two errors are the same: of a recording at rest
-_MAX_SPLITS = 2000
+_MAX_SPLITS: Capacity[int] = 2000
 _LogRatios = Mapping[str, Mapping[str, float]]  # over the first configuration's, by system and rig
 
 
@@ -109,7 +110,7 @@ def _log_ratios(runs: Sequence[Outcome], systems: Sequence[str]) -> _LogRatios:
         if value is not None:
             rig = run.rig or run.sequence
             by_rig = ate.setdefault(rig, {}).setdefault(run.system, {})
-            by_rig[run.sequence, run.seed] = math.log(max(value, _FLOOR_M))
+            by_rig[run.sequence, run.seed] = math.log(max(value, FLOOR))
     out: dict[str, dict[str, float]] = {system: {} for system in systems}
     for rig, by_system in ate.items():
         if len(by_system) < len(systems):

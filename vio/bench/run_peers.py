@@ -28,13 +28,14 @@ from vio.datasets.rigs import load_rig
 from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.files.trajectories import read_trajectory, write_tum
+from vio.numerics.kinds import Capacity
 from vio.offline.convert import convert
 from vio.offline.convert_spectacularai import write_spectacularai
 from vio.protocols import Dataset
 from vio.records import S_PER_NS
 from vio.targets.results import basalt_text
 
-_LONGEST_S = 3600.0  # a replay
+_LONGEST_S: Capacity[float] = 3600.0  # a replay
 _PLAYER = Path(__file__).parent / "spectacularai_player.py"
 
 

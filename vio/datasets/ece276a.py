@@ -31,6 +31,7 @@ from vio.datasets.common import (
     shape_text,
 )
 from vio.datasets.features import FeatureDataset
+from vio.datasets.kitti import RECTIFIED_SHARE
 from vio.datasets.reader import Reader
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings, ExtrinsicsMode
@@ -55,8 +56,6 @@ NEW_KEYS = ("timestamps", "features", "v_t", "w_t", "K_l", "K_r", "extL_T_imu", 
 class _RigRules(NamedTuple):
     """How the rig of a file is understood."""
 
-    # allowed offset of the right camera from the left one's x axis, as a share of the baseline
-    rectified_rad: float = 0.02
     # difference below which both interpretations of the translation are the same
     same_m: float = 1e-3
     # largest deviation from identity of the rotation between rectified cameras
@@ -203,7 +202,7 @@ def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibrati
         T_cam1_cam0 = right @ se3_inverse(left)
         x, y, z = T_cam1_cam0[:3, 3]
         aligned = np.abs(T_cam1_cam0[:3, :3] - np.eye(3)).max() < _RIG.max_deviation
-        if aligned and x < 0 and np.hypot(y, z) < _RIG.rectified_rad * -x:
+        if aligned and x < 0 and np.hypot(y, z) < RECTIFIED_SHARE * -x:
             return _Calibration(_camera(K, float(-x), path), left, ambiguous=False)
     raise CalibrationError(
         f"{path}: extL_T_imu and extR_T_imu place the cameras "

@@ -19,6 +19,7 @@ import numpy as np
 
 from vio.datasets.common import naming
 from vio.datasets.features import FeatureDataset
+from vio.datasets.kitti import DRIVE_NS
 from vio.datasets.reader import Reader
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import refuse_swapped
@@ -29,7 +30,6 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import FeatureTracks, IntArray, Recording, Trajectory
 
 _FACTORS = "stereo_factors"
-_FRAME_NS = 100_000_000  # KITTI's cameras
 _COLUMNS = "pose landmark uL uR v X Y Z"
 
 
@@ -68,7 +68,7 @@ def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDa
         offsets, ids[order], z, np.ones(rows, dtype=np.bool_), np.zeros(rows, dtype=np.bool_)
     )
     refuse_swapped(tracks, file)
-    times_ns: IntArray = (numbers - numbers[0]) * _FRAME_NS
+    times_ns: IntArray = (numbers - numbers[0]) * DRIVE_NS
     poses_file = _beside(file, "camera_poses")
     recording = Recording(
         kind="gtsam",
@@ -80,7 +80,7 @@ def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDa
         motion=frozenset(),
         reference=None if poses_file is None else _reference(poses_file, numbers, times_ns),
         notes=(
-            f"{file.name} states no times; frames are taken to be {_FRAME_NS * 1e-9:g} s apart, so "
+            f"{file.name} states no times; frames are taken to be {DRIVE_NS * 1e-9:g} s apart, so "
             "speeds are unknown",
             f"not used: the points X Y Z of {file.name}",
         ),

@@ -37,7 +37,7 @@ _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
 _NETPBM = (b"P2", b"P3", b"P5", b"P6")  # as text, and in binary
-_MAX_BYTES = 2**29  # of a file: more than 64 Mpx of 16 bits in colour
+_MAX_BYTES: Capacity[int] = 2**29  # of a file: more than 64 Mpx of 16 bits in colour
 # start-of-frame markers, with the image size
 _JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 _EXIF_BYTES = 4096  # from the beginning of a file, where its orientation stands

@@ -22,7 +22,8 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, VelocitySample
 
 # allowed offset of the right camera from the left one's x axis, as a share of the baseline
-_RECTIFIED = 0.02
+RECTIFIED_SHARE = 0.02
+DRIVE_NS = 100_000_000  # between frames of a drive
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,7 @@ def read_calibration(path: Path, cameras: tuple[int, int]) -> _Calibration:
             "column is -focal * baseline), so check for equal or exchanged matrices"
         )
     off_axis = float(np.hypot(y, z))
-    if off_axis > _RECTIFIED * x:
+    if off_axis > RECTIFIED_SHARE * x:
         raise CalibrationError(
             f"{path}: {names} put the right camera {off_axis:g} m off the left one's x axis; "
             "rectify"

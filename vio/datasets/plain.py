@@ -37,6 +37,7 @@ from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
 from vio.datasets.image_times import counted_apart, frame_times, pair_files, times_of
 from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
+from vio.datasets.kitti import DRIVE_NS
 from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
 from vio.datasets.lost_images import CountedApart, pairs_in_step
 from vio.datasets.reader import Reader
@@ -72,7 +73,6 @@ ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb"
 _GRAY = (0, 1)  # of KITTI
 _COLOUR = (2, 3)
 _INSIDE = ("data", "images", "")
-_DRIVE_NS = 100_000_000  # between frames of a KITTI drive
 
 
 class _FolderRules(NamedTuple):
@@ -391,7 +391,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
     if used[0].is_file():
         times_ns = drive_times(used[0], numbers)
     else:
-        times_ns = numbers * _DRIVE_NS
+        times_ns = numbers * DRIVE_NS
         notes = (f"{used[0]} is missing; times follow from the frame numbers at 10 Hz", *notes)
     read = ReadImages("kitti_raw", layout, (file, rig), (times_ns, used[0]), notes, used)
     parts = read_companions(read, settings)

@@ -23,7 +23,6 @@ class _OrderRules(NamedTuple):
 
     large_deg: float = 5.0  # of a spread, below which no order is doubted
     better_ratio: float = 5.0  # by which the right order must explain the attitudes better
-    min_poses: int = 3
 
 
 _ORDER = _OrderRules()
@@ -93,8 +92,6 @@ def _spread_deg(estimate: Trajectory, reference: Trajectory, limit_s: float) -> 
     """
     try:
         _, rows, reference_rows = associate(estimate, reference, max_time_difference_s=limit_s)
-        if len(rows) < _ORDER.min_poses:
-            return None
         T_est = estimate.T_world_body[rows]
         T_ref = reference.T_world_body[reference_rows]
         alignment = align_poses(T_est, T_ref, "se3")

@@ -17,6 +17,7 @@ from vio.geometry.lie import (
     rotation_from_quat_xyzw,
     so3_log,
 )
+from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import median
 
 # median attitude error that no odometry has whose positions agree; other axes are 90 deg off or
@@ -29,7 +30,8 @@ class _AxisRules:
     """When another convention of axes explains the errors of attitude."""
 
     constant: float = 0.2  # of that error may vary where one rotation explains it
-    alike_deg: float = 1e-3  # between what two causes leave: nothing tells which one it is
+    # between what two causes leave: nothing tells which one it is
+    alike_deg: Tolerance[float] = 1e-3
     sigmas: float = 5.0  # of the rotation about the path, where the positions leave it uncertain
     # a rotation so near one of the 24 that exchange axes is called by its whole degrees
     axes_deg: float = 5.0

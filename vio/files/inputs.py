@@ -11,7 +11,9 @@ import os
 import stat
 from pathlib import Path
 
-MAX_BYTES = 2**30  # of a text file: an hour of IMU at 1 kHz is half of that
+from vio.numerics.kinds import Capacity
+
+MAX_BYTES: Capacity[int] = 2**30  # of a text file: an hour of IMU at 1 kHz is half of that
 # `vio eval <(command) …` reads a pipe with a writer.
 _READABLE = (os.devnull, "/dev/fd/", "/proc/self/fd/", "/dev/stdin")
 

@@ -18,7 +18,7 @@ from vio.geometry.lie import FloatArray
 from vio.numerics.kinds import Capacity
 from vio.records import NS_PER_S, IntArray
 
-INT64_MAX = 2**63 - 1
+INT64_MAX = int(np.iinfo(np.int64).max)
 # ORB-SLAM writes nanoseconds with a point and zeros behind it
 _WHOLE = re.compile(r"(\d{1,19})(?:\.0*)?")
 _SIGNED = re.compile(r"([+-]?\d{1,19})(?:\.0*)?")

@@ -32,7 +32,7 @@ from vio.geometry.lie import (
     se3_from_parts,
     se3_inverse,
 )
-from vio.numerics.kinds import Tolerance
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.records import BodyFrame, BoolArray, IntArray, Orientations, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -69,7 +69,7 @@ class _CommentRules(NamedTuple):
     """How much of a comment is read and shown."""
 
     # bytes: the frames of a day with gaps are numbered in a comment of less
-    max_line_bytes: int = 2**20
+    max_line_bytes: Capacity[int] = 2**20
     max_list_characters: int = 100  # characters of frame numbers in a warning
 
 

@@ -36,7 +36,7 @@ from vio.records import Estimate, FrameResult, Landmarks, MotionSample
 log = logging.getLogger(__name__)
 
 # results after which the points that will not change any more are taken from the filter
-_LANDMARK_FRAMES = 100
+_LANDMARK_FRAMES: Capacity[int] = 100
 # estimates that wait for the reader; of a slower one, the oldest are forgotten
 _MAX_WAITING: Capacity[int] = 1000
 

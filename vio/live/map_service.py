@@ -29,6 +29,7 @@ from vio.datasets.images import UnreadableImageError, decode_gray
 from vio.errors import DataError, VioError
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.lookup import FoundPose, MapLookup
+from vio.numerics.kinds import Capacity
 from vio.records import Image
 
 
@@ -36,7 +37,7 @@ class _RequestLimits(NamedTuple):
     """What a request may be."""
 
     max_bytes: int = 64 << 20  # of a request: two images of 16 megapixels
-    silent_s: float = 30.0  # after which a connection that says nothing is closed
+    silent_s: Capacity[float] = 30.0  # after which a connection that says nothing is closed
     same_camera_share: float = 1e-3  # by which the lengths of one camera may differ
 
 

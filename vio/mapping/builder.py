@@ -23,6 +23,7 @@ from vio.mapping.features import KeyframeFeatures
 from vio.mapping.map_graph import MapGraph, Placed
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.place_finder import GATE, FoundPlace, PlaceFinder, squared
+from vio.numerics.kinds import Capacity
 from vio.records import BoolArray, LoopEvent
 
 log = logging.getLogger(__name__)
@@ -38,7 +39,7 @@ class _SettlingRules(NamedTuple):
     # squared error of a new loop, its expected value, up to which the optimisation can wait …
     settled_error: float = 6.0
     waiting_loops: int = 8  # … for so many loops
-    commit_keyframes: int = 20  # keyframes
+    commit_keyframes: Capacity[int] = 20  # keyframes
 
 
 _SETTLING = _SettlingRules()

@@ -37,8 +37,8 @@ class _GraphRules:
     """How many keyframes take part in an optimisation."""
 
     # of the search for them, in mean variances of a motion; and from try to try
-    first_reach: float = 30.0
-    further: float = 2.0
+    first_reach: Capacity[float] = 30.0
+    further: Capacity[float] = 2.0
     max_exact: Capacity[int] = (
         200  # keyframes whose covariance is computed, beside the first of each session
     )

@@ -32,6 +32,7 @@ from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import LoopRow, MapStore, PlacesRow
 from vio.mapping.overlap import Overlaps
 from vio.mapping.place_index import SEGMENT, PlaceIndex
+from vio.numerics.kinds import Capacity
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
 
@@ -65,7 +66,7 @@ class _PlaceRules:
     guided_m: float = 0.5  # standard deviation of the position up to which places are searched
     # keyframes whose points are held, 6 MB: from query to query, most of those searched are the
     # same
-    shown: int = 64
+    shown: Capacity[int] = 64
 
 
 _PLACES = _PlaceRules()

@@ -16,6 +16,7 @@ from vio.evaluation.trajectories import metres_text
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.upright import yaw_and_position
 from vio.mapping.map_store import MapStore
+from vio.numerics.kinds import Capacity
 from vio.offline.inertial_refinement import (
     InertialRefinement,
     InertialRun,
@@ -28,7 +29,8 @@ from vio.records import IntArray, MapKeyframes, feature_tracks
 from vio.runs.mapped import MappedRun, corrected
 from vio.runs.pipeline import RunResult
 
-MAX_KEYFRAMES = 1500  # of the adjustment, four a second: its time and memory grow with them
+# of the adjustment, four a second: its time and memory grow with them
+MAX_KEYFRAMES: Capacity[int] = 1500
 _MAX_SIGMAS = 3.0  # by which it may move the map, by the map's covariance
 
 

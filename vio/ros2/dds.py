@@ -42,9 +42,9 @@ class _QueueLimits(NamedTuple):
 
     # messages that wait for `spin`; of a topic that must not lose any, all
     depth_messages: Capacity[int] = 1000
-    max_images: int = 50  # that wait where none must be lost: then the sender waits
+    max_images: Capacity[int] = 50  # that wait where none must be lost: then the sender waits
     taken_messages: Capacity[int] = 10_000  # at a time
-    last_s: float = 30.0  # that a receiver may take for the last messages
+    last_s: Capacity[float] = 30.0  # that a receiver may take for the last messages
 
 
 _QUEUE = _QueueLimits()

@@ -18,7 +18,7 @@ from vio.datasets.bags.cdr import live_decoded
 from vio.datasets.bags.index import stamp_of
 from vio.datasets.bags.pictures import band_of_message, gray_of
 from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
-from vio.datasets.levels import Band, Levels, levels_of
+from vio.datasets.levels import LEVEL_IMAGES, Band, Levels, levels_of
 from vio.errors import DataError, VioError
 from vio.geometry.lie import FloatArray
 from vio.live.live_odometry import LiveOdometry
@@ -43,7 +43,6 @@ _STAMPS = _StampRules()
 # A stamp so far ahead of the last one begins anew, too, where less than a tenth of that time has
 # passed: the clock was set. A gap in a bag that is played ten times as fast is none.
 _AHEAD_NS = 5 * NS_PER_S
-_LEVEL_IMAGES = 8  # of 16 bits, looked at for the levels of black and white
 _MAX_REASONS = 50  # that are named
 
 
@@ -218,7 +217,7 @@ class Sensors:
 
     def _gray_levels(self, fields: Any, kind: str, where: str) -> Levels:
         """Return the levels of black and white of 16-bit images, from the first ones."""
-        if len(self._bands) < _LEVEL_IMAGES:
+        if len(self._bands) < LEVEL_IMAGES:
             band = band_of_message(fields, where, compressed=kind == COMPRESSED)
             self._bands += [] if band is None else [band]
         return levels_of(self._bands)

@@ -19,6 +19,7 @@ from vio.datasets.samples import motion_samples
 from vio.files.tables import Rows, Table
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Capacity
 from vio.records import (
     Estimate,
     FrameLog,
@@ -63,7 +64,7 @@ _FIELD = {
     "stereo_rows_covariance": "rows_covariance",
 }
 _SCALE = {"stereo_scale": "logs", "stereo_scale_covariance": "covariance"}
-_STAGES = 16  # of the front end, at most
+_STAGES: Capacity[int] = 16  # of the front end, at most
 _COUNTS = (
     "detected",
     "tracked",

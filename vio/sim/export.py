@@ -23,6 +23,7 @@ from vio.datasets.euroc_files import (
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.datasets.rigs.kalibr import kalibr_text
+from vio.datasets.tum_rgbd import DEPTH_FACTOR
 from vio.errors import SimulationError
 from vio.files.atomic import atomic_folder
 from vio.files.text import exact_text, seconds_text, write_text
@@ -177,7 +178,6 @@ def description(recording: SimulatedRecording) -> str:
 class _DepthSensor:
     """A depth camera of structured light."""
 
-    factor: int = 5000  # levels per metre, as TUM's
     noise: float = 1.5e-3  # 1/m, k of a depth's standard deviation k z^2: structured light
     nearest_m: float = 0.4  # beyond them such a sensor gives none
     farthest_m: float = 8.0
@@ -205,7 +205,7 @@ def export_rgbd(
     simulation = recording.simulation
     T_cam0_imu = se3_inverse(simulation.calibration.T_imu_cam0)
     T_stated = None if simulation.imu is None else T_cam0_imu
-    rig = Rig(simulation.calibration.cam0, T_cam0_imu=T_stated, depth_factor=_DEPTH.factor)
+    rig = Rig(simulation.calibration.cam0, T_cam0_imu=T_stated, depth_factor=DEPTH_FACTOR)
     truth = (
         recording.reference
         if simulation.imu is not None
@@ -240,4 +240,4 @@ def _levels(depth_m: FloatArray, rng: np.random.Generator) -> np.ndarray:
     z = np.where(np.isfinite(depth_m), depth_m, 0.0)
     noisy = z + rng.normal(size=z.shape) * _DEPTH.noise * z**2
     inside = (z > _DEPTH.nearest_m) & (z < _DEPTH.farthest_m)
-    return np.rint(np.where(inside, noisy, 0.0) * _DEPTH.factor).astype(np.uint16)
+    return np.rint(np.where(inside, noisy, 0.0) * DEPTH_FACTOR).astype(np.uint16)

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 from vio.sim.lighting import Light
 from vio.sim.render import CameraRays, Radiance, View, cast
 from vio.sim.world import Surfaces, World, surfaces_at
@@ -24,7 +25,7 @@ from vio.sim.world import Surfaces, World, surfaces_at
 class _GlareRules:
     """How lamps and the sun look in an image."""
 
-    grid_px: int = 4  # pixels between computed values; halos and ghosts are smooth
+    grid_px: Tolerance[int] = 4  # pixels between computed values; halos and ghosts are smooth
     core_rad: float = 0.012  # the sun's bright centre: its radius, and its light over the source's
     core: float = 3.0
     halo_rad: float = 0.12  # the wide part of the halo: its radius, and its light over the source's

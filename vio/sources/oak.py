@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.live.pairing import Pairing
 from vio.numerics.kinds import Capacity
 from vio.records import Image
-from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
+from vio.sources.source import LOST_S, ImuInterpolation, SourceEvent, SourceFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +38,7 @@ _COEFFICIENTS = 8
 _FISHEYE_COEFFICIENTS = 4
 
 
-class _Waits(NamedTuple):
-    """How long a camera is waited for."""
-
-    pause_s: Capacity[float] = 0.002
-    lost_s: float = 5.0
-
-
-_WAITS = _Waits()
+_PAUSE_S: Capacity[float] = 0.002  # where nothing has come
 
 
 class OakSource:
@@ -194,9 +187,9 @@ class OakSource:
             if came:
                 last_s = time.monotonic()
                 continue
-            if time.monotonic() - last_s > _WAITS.lost_s:
-                raise DataError(f"{self._name}: nothing for {_WAITS.lost_s:.0f} s; check the cable")
-            time.sleep(_WAITS.pause_s)
+            if time.monotonic() - last_s > LOST_S:
+                raise DataError(f"{self._name}: nothing for {LOST_S:.0f} s; check the cable")
+            time.sleep(_PAUSE_S)
             yield None
 
     def close(self) -> None:

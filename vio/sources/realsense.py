@@ -22,7 +22,7 @@ from vio.geometry.lie import FloatArray, se3_from_parts
 from vio.live.pairing import Pairing
 from vio.numerics.kinds import Capacity
 from vio.records import Image
-from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame
+from vio.sources.source import LOST_S, ImuInterpolation, SourceEvent, SourceFrame
 
 log = logging.getLogger(__name__)
 
@@ -34,11 +34,10 @@ class _Streams:
     width: int = 640
     height: int = 480
     rate_hz: int = 30
-    silent_s: float = 0.5
+    silent_s: Capacity[float] = 0.5  # a step in which silence is counted
 
 
 _STREAMS = _Streams()
-_LOST_S = 5.0
 _WAITING: Capacity[int] = 1000  # frames and samples that may wait for the reader
 
 # The distortion of the infrared images, which the device rectifies; of raw ones, OpenCV's.
@@ -234,9 +233,9 @@ class RealSenseSource:
                     and self._device.as_playback().current_status() == rs.playback_status.stopped
                 ):
                     return
-                if silent_s >= _LOST_S:
+                if silent_s >= LOST_S:
                     raise DataError(
-                        f"realsense:{self._name}: nothing for {_LOST_S:.0f} s; check the cable"
+                        f"realsense:{self._name}: nothing for {LOST_S:.0f} s; check the cable"
                     ) from None
                 yield None
                 continue

@@ -13,6 +13,9 @@ from vio.errors import ConfigError
 from vio.geometry.lie import FloatArray
 from vio.records import Image, ImuSample
 
+# without an image or sample, after which a device has gone
+LOST_S = 5.0
+
 Layout: TypeAlias = Literal["side-by-side", "top-bottom", "single"]
 
 

@@ -68,7 +68,7 @@ class _Priors(NamedTuple):
 
 
 _PRIORS = _Priors()
-_MEDIAN_TO_SIGMA = 1.1774  # of the length of a vector of two Gaussian components
+MEDIAN_TO_SIGMA = 1.1774  # of the length of a vector of two Gaussian components
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +244,7 @@ class BoardAdjustment:
         for c in range(self.seen.cameras):
             mine = length[self.seen.camera == c]
             if len(mine):
-                out[c] = max(median(mine) / _MEDIAN_TO_SIGMA, _WEIGHTS.min_sigma_px)
+                out[c] = max(median(mine) / MEDIAN_TO_SIGMA, _WEIGHTS.min_sigma_px)
         return out
 
     def _final_sigmas(self, r: FloatArray, used: BoolArray) -> FloatArray:
@@ -266,7 +266,7 @@ class BoardAdjustment:
         )
         middle = 0.5 * (length[order[first + (count - 1) // 2]] + length[order[first + count // 2]])
         out = np.empty(len(length))
-        out[order] = (middle / _MEDIAN_TO_SIGMA)[image] ** 2
+        out[order] = (middle / MEDIAN_TO_SIGMA)[image] ** 2
         return out
 
     def _image_squares(self, r: FloatArray, used: BoolArray) -> FloatArray:

@@ -23,14 +23,13 @@ from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
 from vio.targets.lenses import LENSES, LensChoice, Rival, choose_lens, rivals_of
 from vio.targets.recording import Filmed
 from vio.targets.start import one_camera, pair_start, pose_only
-from vio.targets.verdict import MIN_VIEWS, Verdict, corners_by_part, judge, part_name
+from vio.targets.verdict import MIN_CORNERS, MIN_VIEWS, Verdict, corners_by_part, judge, part_name
 from vio.targets.views import Sightings, sightings
 
 
 class _ViewRules(NamedTuple):
     """Which views are used, and what of them is doubted."""
 
-    min_corners: int = 12  # of a view that is used
     max_views: int = 60
     doubt_sigmas: float = 2.0  # stated, beyond which another lens model's difference is named
     min_doubt_px: float = 0.1
@@ -156,12 +155,12 @@ def calibrate_with_imu(
         raise DataError("the recording has no IMU; record its samples with the images")
     seen = sightings(filmed.views, target.points_m)
     left = np.bincount(seen.view[seen.camera == 0], minlength=seen.views)
-    chosen = np.flatnonzero(left >= _VIEWS.min_corners)
+    chosen = np.flatnonzero(left >= MIN_CORNERS)
     seen = seen.of_views(chosen)
     problem, found = pose_only(cameras.found.at, seen)
     # A view that fits badly has a wrong pose.
     used = np.bincount(seen.view[found.used & (seen.camera == 0)], minlength=seen.views)
-    good = np.flatnonzero(used >= _VIEWS.min_corners)
+    good = np.flatnonzero(used >= MIN_CORNERS)
     times_ns = np.array([filmed.views[v].time_ns for v in chosen[good].tolist()], dtype=np.int64)
     information, xi_D_lens = problem.pose_information(found)
     variance = cameras.verdict.inflation**2
@@ -181,7 +180,7 @@ def chosen_views(seen: Sightings) -> Sightings:
     """
     image = seen.view * seen.cameras + seen.camera
     counts = np.bincount(image, minlength=seen.views * seen.cameras)
-    kept = seen.take(np.flatnonzero(counts[image] >= _VIEWS.min_corners))
+    kept = seen.take(np.flatnonzero(counts[image] >= MIN_CORNERS))
     views: IntArray = np.unique(kept.view)
     if len(views) > _VIEWS.max_views:
         total = np.bincount(kept.view, minlength=seen.views)
@@ -208,7 +207,7 @@ def _explained(filmed: Filmed, camera: int, target: Target) -> Iterator[None]:
 def _check_views(filmed: Filmed, target: Target) -> None:
     names = ("left", "right") if len(filmed.sizes) > 1 else ("only",)
     for c, name in enumerate(names):
-        count = sum(len(view.corners[c]) >= _VIEWS.min_corners for view in filmed.views)
+        count = sum(len(view.corners[c]) >= MIN_CORNERS for view in filmed.views)
         if count < MIN_VIEWS:
             if (reason := _diagnosis(filmed, c, target)) is not None:
                 raise DataError(f"{name} camera: {reason}")
@@ -235,7 +234,7 @@ def _check_views(filmed: Filmed, target: Target) -> None:
         images = [images[c] for images in filmed.samples]
         if (other := clearly_other_board(images, target)) is not None:
             raise DataError(f"{name} camera: {other}")
-    together = sum(min(map(len, view.corners)) >= _VIEWS.min_corners for view in filmed.views)
+    together = sum(min(map(len, view.corners)) >= MIN_CORNERS for view in filmed.views)
     if together < MIN_VIEWS // 2:
         raise DataError(
             f"the cameras see the board together in {together} frames, and {MIN_VIEWS // 2} are "
@@ -251,7 +250,7 @@ def _places(filmed: Filmed, camera: int) -> int:
     known: list[Corners] = []
     for view in filmed.views:
         corners = view.corners[camera]
-        if len(corners) < _VIEWS.min_corners:
+        if len(corners) < MIN_CORNERS:
             continue
         if all(_apart_px(corners, other) > _SAME_PLACE_PX for other in known):
             known.append(corners)

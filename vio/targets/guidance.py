@@ -18,7 +18,7 @@ from vio.records import NS_PER_S, Image, ImuSample
 from vio.targets.corners import CornerDetector, Corners
 from vio.targets.description import Target
 from vio.targets.homography import derivative, homographies, mapped
-from vio.targets.verdict import CELLS, MIN_TILT_DEG, corners_by_part, part_name
+from vio.targets.verdict import CELLS, MIN_CORNERS, MIN_TILT_DEG, corners_by_part, part_name
 
 ENOUGH_VIEWS = 30
 
@@ -26,7 +26,6 @@ ENOUGH_VIEWS = 30
 class _ViewRules(NamedTuple):
     """What the views of a board must show."""
 
-    min_corners: int = 12
     min_cell_corners: int = 12  # in a part of an image
     min_tilted_views: int = 3  # views, in each direction
     min_scale_ratio: float = 1.6  # of the nearest view over the farthest
@@ -88,7 +87,7 @@ class Guidance:
             self._sizes = [(image.shape[1], image.shape[0]) for image in images]
             self._cells = [np.zeros(CELLS**2) for _ in images]
         found = tuple(self._detector.detect(image) for image in images)
-        if max(map(len, found)) < _VIEWS.min_corners or not self._is_new(found):
+        if max(map(len, found)) < MIN_CORNERS or not self._is_new(found):
             return False
         self._views.append(found)
         for cells, corners, size in zip(self._cells, found, self._sizes, strict=True):
@@ -101,7 +100,7 @@ class Guidance:
 
     def lacks(self) -> Lacks:
         """Return what is missing now."""
-        together = sum(min(map(len, view)) >= _VIEWS.min_corners for view in self._views)
+        together = sum(min(map(len, view)) >= MIN_CORNERS for view in self._views)
         count = len(self._views)
         wanted: list[str] = []
         if not count:
@@ -120,7 +119,7 @@ class Guidance:
             moved: list[float] = []
             for new, old, (width, _) in zip(found, view, self._sizes, strict=True):
                 _, mine, its = np.intersect1d(new.ids, old.ids, return_indices=True)
-                if len(mine) >= _VIEWS.min_corners // 2:
+                if len(mine) >= MIN_CORNERS // 2:
                     apart = np.linalg.norm(new.uv[mine] - old.uv[its], axis=1)
                     moved.append(median(apart) / width)
             if moved and max(moved) < _VIEWS.min_moved_share:

@@ -34,6 +34,7 @@ from vio.geometry.lie import (
 from vio.numerics.kinds import Tolerance
 from vio.numerics.statistics import chi_square_quantile
 from vio.targets.bundle import (
+    MEDIAN_TO_SIGMA,
     Adjusted,
     BoardAdjustment,
     BoolArray,
@@ -60,13 +61,13 @@ class _CheckRules(NamedTuple):
 
 
 _CHECKS = _CheckRules()
-_MEDIAN_LENGTH = 1.1774  # of a vector of two Gaussian components of unit variance
 _UNEQUAL = 2.0  # residual of one camera over the other's, each adjusted alone
 MIN_TILT_DEG = 15.0
 CELLS = 3  # along each side of the image, which must hold corners
 _ROWS = ("upper", "middle", "lower")
 _COLS = ("left", "centre", "right")
 MIN_VIEWS = 8
+MIN_CORNERS = 12  # of a view that is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,7 +288,7 @@ def _map_ratio(difference: Adjusted, off_px: Sequence[FloatArray], depth_m: floa
     ratios: list[float] = []
     for camera, lens, off in zip(cameras, lenses, off_px, strict=True):
         sigma = projection_sigma(camera, difference.covariance[lens, lens])
-        ratios.append(float(np.nanmedian(off / (_MEDIAN_LENGTH * np.maximum(sigma, 1e-9)))))
+        ratios.append(float(np.nanmedian(off / (MEDIAN_TO_SIGMA * np.maximum(sigma, 1e-9)))))
     if len(cameras) > 1:
         depth = 0.5 * depth_sigma(difference)
         depth = depth[np.isfinite(depth)]

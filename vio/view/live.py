@@ -18,7 +18,7 @@ import numpy as np
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays
 from vio.geometry.upright import rotated, upright_view
-from vio.numerics.kinds import Capacity
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.records import (
     BoolArray,
     Estimate,
@@ -44,7 +44,7 @@ _OUTLINE = f"{_LEFT}/outline"  # of what a camera sees whose image is not a pinh
 class _Picture:
     """What the pictures of the viewer show."""
 
-    side: int = 25  # points of a side of it
+    side: Tolerance[int] = 25  # points of a side of it
     outline_baselines: float = 5.0  # distance from the camera at which it is drawn
     # of the run's time that images, tracks and points may take; the rest is drawn in every frame
     share: float = 0.08

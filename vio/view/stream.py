@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from vio.errors import ConfigError, DataError, extra_text
+from vio.numerics.kinds import Capacity
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -21,7 +22,7 @@ log = logging.getLogger(__name__)
 _WEB_PORT = 9090
 _APPLICATION = "stereo-vio"  # rerun's name of the program, which stands in the head of its files
 _RRD = b"RRF"  # what a file of rerun begins with
-_HEAD_BYTES = 4096
+_HEAD_BYTES: Capacity[int] = 4096  # of a file, among which the program is named
 
 
 def open_stream(where: str, name: str) -> tuple[rr.RecordingStream, str | None]:
