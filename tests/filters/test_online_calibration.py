@@ -402,6 +402,17 @@ def test_pose_at_an_exposure_follows_the_time_offset() -> None:
     )
 
 
+def test_the_random_walk_of_the_field_is_that_of_the_mount_whatever_the_prior() -> None:
+    walks = [
+        online_calibration.walk_variances(MsckfSettings(stereo_yaw_sigma_deg=yaw_deg))[
+            "stereo_field"
+        ]
+        for yaw_deg in (0.05, 0.2)
+    ]
+    np.testing.assert_array_equal(walks[1], walks[0])
+    assert np.sqrt(walks[0][0]) == pytest.approx(np.radians(0.001))
+
+
 # On exact flights
 
 

@@ -50,6 +50,7 @@ class _Walks(NamedTuple):
     time_offset_s: float = 2.0e-6
     # random walk of the rectification error per root second, over its initial standard deviation
     stereo_share: float = 0.02
+    stereo_yaw_deg: float = 1.0e-3  # but of the right camera's rotation about its vertical axis
 
 
 _WALKS = _Walks()
@@ -361,6 +362,11 @@ class _StereoFieldBlock(StereoBlock):
 
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
         return stereo_field_sigmas(MAX_FIELD_SIGMA, stereo_yaw_rad(settings))
+
+    def walks(self, settings: MsckfSettings) -> FloatArray:
+        # How well a calibration is known says nothing of how fast a mount gives.
+        yaw_rad = float(np.radians(_WALKS.stereo_yaw_deg))
+        return np.append(yaw_rad, super().walks(settings)[1:])
 
     def report(
         self, calibration: Calibration, nav: NavState, covariance: FloatArray
