@@ -89,7 +89,7 @@ def verdict(form: Form) -> str:
             return f"refused: {_plain(str(error), folder)}"
     doubts = [note for note in rig.notes if "doubtful" in note]
     if not doubts:
-        return "read"
+        return "✓"
     doubt = _plain(doubts[0], folder).removeprefix("doubtful: ")
     return f"read with a doubt: {doubt.split('; ')[0]} …"  # the message goes on with remedies
 

@@ -683,6 +683,8 @@ class Recording:
     motion_notes: tuple[str, ...] = ()  # those of them that are on motion samples only
     # observation logs: what the run behind the log used; None: not known
     run_motion: RunMotion | None = None
+    # (F,) increasing, by which images are named where that counts frames; None: it does not
+    image_numbers: IntArray | None = None
 
     @property
     def doubts(self) -> tuple[str, ...]:

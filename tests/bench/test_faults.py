@@ -8,7 +8,7 @@ import itertools
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from tests.frontend.test_frontend_scene import CAMERA
 from tools.faults import CAMERAS, GROUPS, HEALTHY, IMU
 from tools.faults import __main__ as command
 from tools.faults.__main__ import FIGURES, PAGE, RUNS, tasks
-from tools.faults.changes import Period
+from tools.faults.changes import Changed, Period
 from tools.faults.page import page
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
@@ -101,6 +101,30 @@ def test_a_part_of_a_variant_with_fewer_frames_has_all_of_its_frames(group: str,
     stop = len(changed.recording.frame_times_ns) - 1
     found = [e.index for e in changed.events(1, stop) if isinstance(e, StereoFrame)]
     assert found == list(range(1, stop))
+
+
+def test_a_part_of_the_reversed_recording_is_that_of_the_whole() -> None:
+    """The first frames had the pixels of the first ones of the source, and times of the end."""
+    changed = HEALTHY["reverse"](_Flight(), PERIOD)
+    whole = [event for event in changed.events() if isinstance(event, StereoFrame)]
+    part = [event for event in changed.events(2, 7) if isinstance(event, StereoFrame)]
+    assert [frame.index for frame in part] == list(range(2, 7))
+    for frame in part:
+        same = whole[frame.index]
+        assert (frame.index, frame.time_ns) == (same.index, same.time_ns)
+        np.testing.assert_array_equal(frame.left, same.left)
+
+
+def test_the_reference_of_a_reversed_recording_may_be_shorter_than_it() -> None:
+    flight = _Flight()
+    truth = Trajectory(POSES[:12], None, "imu")
+    recording = replace(flight.recording, reference=truth)
+    changed = HEALTHY["reverse"](Changed(flight, recording, iter), PERIOD)
+    reference = changed.recording.reference
+    assert reference is not None
+    assert reference.frame_indices is not None
+    np.testing.assert_array_equal(reference.frame_indices, np.arange(FRAMES - 12, FRAMES))
+    np.testing.assert_array_equal(reference.T_world_body, POSES[11::-1])
 
 
 def _equal(a: list[Event], b: list[Event]) -> bool:

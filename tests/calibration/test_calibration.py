@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,9 @@ from vio.cameras.projection import camera_args
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import StereoCamera, project
-from vio.records import ImuSample, feature_tracks
+from vio.offline import calibrate
+from vio.offline.self_calibration import NAMES, SelfCalibration
+from vio.records import FeatureTracks, ImuSample, feature_tracks
 from vio.sim.imu import ImuNoise, simulate_imu
 from vio.sim.motion import MotionSpline, hand_held, motion_at
 
@@ -108,6 +111,9 @@ def test_stereo_extrinsics_have_consistent_standard_deviations(estimate: StereoE
     assert swing < max(0.1, 4 * estimate.direction_sigma_deg)
     # what a lens model may leave, which pairs cannot tell from yaw
     assert 0.15 < estimate.rotation_sigma_deg < 0.2
+    assert estimate.rotation_sigmas_deg is not None
+    pitch, yaw, roll = estimate.rotation_sigmas_deg.tolist()
+    assert max(pitch, roll) < 0.02 < 0.2 < yaw < 0.4, "a tangential distortion looks like a yaw"
     assert 1000 < estimate.matches < 1350, "the gross outliers are left out"
     assert estimate.residual_deg == pytest.approx(np.degrees(SIGMA_RAD) * np.sqrt(2), rel=0.25)
 
@@ -374,3 +380,31 @@ def test_rejects_missing_tracks() -> None:
     found = camera_motion(StereoCamera(400, 400, 320, 240, 0.1), none, np.arange(5) * 1_000_000_000)
     assert isinstance(found, NotObservable)
     assert "1 s apart" in found.because
+
+
+@pytest.mark.parametrize(("sigma_deg", "is_used"), [(0.02, True), (1.5, False)])
+def test_motion_is_used_where_it_tells_more_than_single_pairs(
+    sigma_deg: float,
+    is_used: bool,
+    estimate: StereoEstimate,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Twelve frames at standstill: their bundle adjustment had a yaw of -0.64 degrees, sigma 1.5."""
+    camera = StereoCamera(700.0, 700.0, 600.0, 180.0, 0.5, 1200, 370)
+    recording = SimpleNamespace(camera=camera, frame_times_ns=np.arange(3))
+    source = SimpleNamespace(
+        dataset=SimpleNamespace(recording=recording),
+        image_size=lambda z: (1199.0, 369.0),
+        rectifying=lambda: None,
+    )
+    n = len(NAMES)
+    covariance = np.radians(sigma_deg) ** 2 / 3 * np.eye(n)
+    found = SelfCalibration(np.zeros(n), np.zeros(n), covariance, 1, 100, 0.3, 36)
+    monkeypatch.setattr(calibrate, "_segments", lambda *_: ["a piece"])
+    monkeypatch.setattr(calibrate, "self_calibrate", lambda *_, **__: found)
+    z = np.zeros((0, 4))
+    none = np.zeros(0, dtype=np.bool_)
+    tracks = FeatureTracks(np.zeros(4, dtype=np.int64), np.zeros(0, dtype=np.int64), z, none, none)
+    stereo, _, in_motion = calibrate._measure_in_motion(source, estimate, tracks)  # type: ignore[arg-type]
+    assert (in_motion is not None) == is_used
+    assert (stereo is estimate) != is_used

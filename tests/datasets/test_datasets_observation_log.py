@@ -45,7 +45,7 @@ triple = st.tuples(finite, finite, finite).map(np.array)
 def logs(draw: st.DrawFn) -> tuple[Recording, list[Observations], list[MotionSample]]:
     """A recording, what was seen in some of its frames, and the samples in between."""
     count = draw(st.integers(1, 6))
-    times = np.cumsum(draw(st.lists(st.integers(1, 2**40), min_size=count, max_size=count)))
+    times = np.cumsum(draw(st.lists(st.integers(10**6, 2**40), min_size=count, max_size=count)))
     seen = sorted(draw(st.sets(st.integers(0, count - 1))))
     observed = []
     for k in seen:
@@ -161,7 +161,7 @@ def test_round_trip_keeps_every_bit(
 
 
 def _recording(count: int = 3) -> Recording:
-    times = np.arange(count) * 100
+    times = np.arange(count) * 100_000_000
     return Recording("made", Path("x"), CAMERA, None, times, False, frozenset(), None)
 
 
@@ -173,16 +173,16 @@ def _seen(k: int, time_ns: int) -> Observations:
 
 def test_a_left_only_feature_keeps_its_arbitrary_right_pixels(tmp_path: Path) -> None:
     z = np.array([[1.0, 2.0, np.nan, -0.0]])
-    seen = Observations(1, 100, np.array([3]), z, np.array([False]), np.array([True]))
+    seen = Observations(1, 100_000_000, np.array([3]), z, np.array([False]), np.array([True]))
     write_observation_log(tmp_path / "a.npz", _recording(), [seen], [])
     found = read_observation_log(tmp_path / "a.npz").observations(1)
     assert found.z.tobytes() == z.tobytes()
 
 
 def test_frames_that_were_not_processed_yield_no_event_and_no_features(tmp_path: Path) -> None:
-    write_observation_log(tmp_path / "a.npz", _recording(), [_seen(2, 200)], [])
+    write_observation_log(tmp_path / "a.npz", _recording(), [_seen(2, 200_000_000)], [])
     dataset = read_observation_log(tmp_path / "a.npz")
-    assert [frame.time_ns for frame in dataset.events()] == [200]
+    assert [frame.time_ns for frame in dataset.events()] == [200_000_000]
     empty = dataset.observations(0)
     assert len(empty) == 0
     assert dataset.observations(2) is not None
@@ -190,12 +190,17 @@ def test_frames_that_were_not_processed_yield_no_event_and_no_features(tmp_path:
 
 def test_the_bytes_do_not_depend_on_when_they_are_written(tmp_path: Path) -> None:
     for name in ("a.npz", "b.npz"):
-        write_observation_log(tmp_path / name, _recording(), [_seen(2, 200)], [])
+        write_observation_log(tmp_path / name, _recording(), [_seen(2, 200_000_000)], [])
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
 @pytest.mark.parametrize(
-    "observed", [[_seen(2, 200), _seen(1, 100)], [_seen(1, 100), _seen(1, 100)], [_seen(1, 101)]]
+    "observed",
+    [
+        [_seen(2, 200_000_000), _seen(1, 100_000_000)],
+        [_seen(1, 100_000_000), _seen(1, 100_000_000)],
+        [_seen(1, 100_000_001)],
+    ],
 )
 def test_rejects_observations_of_another_recording(
     observed: list[Observations], tmp_path: Path
@@ -212,7 +217,9 @@ def test_error_names_an_unwritable_path_and_leaves_no_file(tmp_path: Path) -> No
 
 
 def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
-    write_observation_log(tmp_path / "good.npz", _recording(), [_seen(0, 0), _seen(2, 200)], [])
+    write_observation_log(
+        tmp_path / "good.npz", _recording(), [_seen(0, 0), _seen(2, 200_000_000)], []
+    )
     arrays = {
         **read_npz(tmp_path / "good.npz"),
         **{k: np.asarray(v) for k, v in changes.items() if v is not None},
@@ -234,8 +241,10 @@ def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
         ({"offsets": [0, 2, 1]}, "the offsets do not split 2 rows into 2 frames"),
         ({"offsets": [0, 2, 2]}, "an id occurs twice in a frame"),
         ({"frame_indices": [0, 3]}, "frame numbers do not increase within 0 to 2"),
-        ({"frame_times_ns": [0, 0, 200]}, "a clock does not increase"),
+        ({"frame_times_ns": [0, 0, 200_000_000]}, "a clock does not increase"),
         ({"motion_values": np.zeros((1, 6))}, "0 motion times"),
+        ({"frame_times_ns": [0, 1, 2]}, "inconsistent: frames come 1 ns apart"),
+        ({"image_numbers": [1]}, "1 numbers of images for 3 frames"),
         ({"image_size": [640]}, "the camera is incomplete"),
         ({"residual_px": -0.5}, "residual_px is -0.5, no number of pixels"),
         ({"sigma": np.ones((1, 2))}, "but sigma is"),
@@ -317,6 +326,12 @@ def test_features_of_another_program_are_written_and_read(tmp_path: Path) -> Non
         ([0], [], "for 0 frames"),
         ([5, 5], [([1], [[1, 2, 0, 2]], None)] * 2, "frame times, entry 1"),
         ([0], [([1, 1], [[1, 2, 0, 2]] * 2, None)], "an id occurs twice"),
+        (
+            [0, 1, 2],
+            [([1], [[1, 2, 0, 2]], None)] * 3,
+            "frames come 1 ns apart, which no sensor does",
+        ),
+        ([5, 38, 71], [([1], [[1, 2, 0, 2]], None)] * 3, "frames come 33 ns apart"),  # ms
         ([0], [([1], [[1, 2, 0]], None)], "frame 0"),
     ],
 )

@@ -459,7 +459,7 @@ BAD = {
                 (f / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 9),
             )
         ),
-        "holds 9 poses for 4 pairs",
+        "holds 9 poses for 4 images",
     ),
     "images of another size": (
         _break(

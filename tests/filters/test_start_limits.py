@@ -396,7 +396,7 @@ def _too_fast(speed_mps: float) -> bool:
     nav = replace(REST, velocity=np.array([speed_mps, 0.0, 0.0]))
     window: Any = SimpleNamespace(prior=SimpleNamespace(P=np.eye(1)), nav=nav)
     try:
-        _check_sane(window, "imu", 0)
+        _check_sane(window, np.eye(1), "imu", 0)
     except DivergedError:
         return True
     return False

@@ -756,7 +756,9 @@ def test_notes_of_the_right_reference_are_empty() -> None:
         ).notes
         == ()
     )
-    assert evaluate(timed(T[:20]), kitti_form(T)).notes == ()
+    numbered = replace(timed(T[:20]), frame_indices=np.arange(20))
+    assert evaluate(numbered, kitti_form(T[:20])).notes == ()
+    assert evaluate(numbered, kitti_form(T).numbered()).notes == ()
     small = se3_from_parts(T[:, :3, :3], 1e-3 * T[:, :3, 3])
     assert evaluate(timed(small), timed(se3_from_parts(T[:, :3, :3], np.ones(3)))).notes == ()
 

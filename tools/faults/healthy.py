@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -27,7 +27,7 @@ from tools.faults.changes import (
 )
 from vio.geometry.lie import se3_from_parts, se3_inverse
 from vio.protocols import Dataset
-from vio.records import Event, Image, ImuSample, StereoFrame, Trajectory
+from vio.records import Event, Image, ImuSample, StereoFrame
 
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
 
@@ -59,35 +59,49 @@ def _mirror(dataset: Dataset, period: Period) -> Changed:
     return with_events(dataset, changed, camera=other, T_cam0_imu=T_new, reference=reference)
 
 
+@dataclass(frozen=True, slots=True)
+class _Backward(Changed):
+    """A recording from its end: the first frames are the source's last ones."""
+
+    def events(
+        self, start: int = 0, stop: int | None = None, *, images: bool = True
+    ) -> Iterator[Event]:
+        """Yield the changed events of some frames, numbered from the end."""
+        count = len(self.recording.frame_times_ns)
+        end = count if stop is None else min(stop, count)
+        return self.change(self.source.events(count - end, count - start, images=images))
+
+
 def _reverse(dataset: Dataset, period: Period) -> Changed:
     """From the end to the start: velocities and rates change their sign, accelerations do not."""
     recording = dataset.recording
     times_ns = recording.frame_times_ns
     reference = recording.reference
     both_ends = int(times_ns[0] + times_ns[-1])
+    last = len(times_ns) - 1
     if reference is not None:
-        back = reference.T_world_body[::-1]
+        reference = reference.numbered()
         times = reference.times_ns
-        frames = np.arange(len(back)) if times is None else None
-        times = None if times is None else both_ends - times[::-1]
-        reference = Trajectory(
-            T_world_body=back, times_ns=times, body=reference.body, frame_indices=frames
+        frames = reference.frame_indices
+        reference = replace(
+            reference,
+            T_world_body=reference.T_world_body[::-1],
+            times_ns=None if times is None else both_ends - times[::-1],
+            frame_indices=None if frames is None else last - frames[::-1],
         )
 
     def changed(events: Iterable[Event]) -> Iterator[Event]:
         held = list(events)
-        number = sum(isinstance(event, StereoFrame) for event in held) - 1
         for event in sorted(
             held, key=lambda event: (-event.time_ns, isinstance(event, StereoFrame))
         ):
             if isinstance(event, ImuSample):
                 yield ImuSample(both_ends - event.time_ns, -event.gyro, event.accel)
             elif isinstance(event, StereoFrame):
-                yield replace(event, index=number - event.index, time_ns=both_ends - event.time_ns)
+                yield replace(event, index=last - event.index, time_ns=both_ends - event.time_ns)
 
-    return with_events(
-        dataset, changed, frame_times_ns=both_ends - times_ns[::-1], reference=reference
-    )
+    other = replace(recording, frame_times_ns=both_ends - times_ns[::-1], reference=reference)
+    return _Backward(dataset, other, changed)
 
 
 def _half(dataset: Dataset, period: Period) -> Changed:

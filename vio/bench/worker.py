@@ -42,6 +42,7 @@ from vio.errors import DataError, EvaluationError, VioError
 from vio.evaluation.association import associate
 from vio.evaluation.errors_along_path import path_length_m
 from vio.evaluation.field_agreement import disparity_field
+from vio.evaluation.numbering import numbered_by_images
 from vio.evaluation.trajectories import MIN_POSES, Evaluation, evaluate
 from vio.files.printable import json_text
 from vio.files.trajectories import read_trajectory, tum_text
@@ -159,7 +160,10 @@ def _truth(job: dict[str, Any], config: Config) -> _Truth:
     total = len(dataset.recording.frame_times_ns)
     spans = _covered_spans(dataset.recording, job["covered"])
     own = dataset.recording.reference
-    reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
+    reference = own
+    if job["reference"] is not None:
+        given = read_trajectory(Path(job["reference"]))
+        reference = numbered_by_images(given, dataset.recording.image_numbers)
     if job["reverse"]:
         backward = Reversed(dataset, first, total if end is None else min(end, total))
         reference = None if reference is None else backward.backward(reference)

@@ -90,13 +90,16 @@ class StereoEstimate:
 
     R_cam1_cam0: FloatArray  # (3, 3)
     direction: FloatArray  # (3,) unit vector from cam0 to cam1, cam0 frame
-    rotation_sigma_deg: float
+    rotation_sigma_deg: float  # by which a verdict judges; a lens model may leave more of a yaw
     direction_sigma_deg: float
     matches: int  # inliers
     pairs: int
     residual_deg: float  # robust spread of the epipolar angle over single pairs
     # segments of video that the values come from; None: single pairs alone
     segments: int | None = None
+    # (3,) standard deviations about the axes of cam1, with what a lens model may leave at these
+    # matches; None: of the rotation as a whole alone
+    rotation_sigmas_deg: FloatArray | None = None
 
 
 def epipolar_angles(
@@ -154,6 +157,8 @@ def refine_stereo(
         R, d = _fit_stereo(inliers, R, d, max(spread, 1e-6))
     spread = robust_sigma(epipolar_angles(R, d, inliers))
     rotation_sigma, direction_sigma = _jackknife_sigmas(inliers, R, d, max(spread, 1e-6))
+    turn, swing = _lens_pose(inliers, R, d, max(spread, 1e-6))
+    sigmas = np.sqrt(rotation_sigma**2 / 3 + turn**2)
     if rotation_sigma > np.radians(_FIT.stereo_rotation_deg) or direction_sigma > np.radians(
         _FIT.stereo_direction_deg
     ):
@@ -167,33 +172,41 @@ def refine_stereo(
         R_cam1_cam0=R,
         direction=d,
         rotation_sigma_deg=float(np.hypot(np.degrees(rotation_sigma), _LENS.lens_deg)),
-        direction_sigma_deg=float(
-            np.degrees(np.hypot(direction_sigma, _lens_swing(inliers, R, d, max(spread, 1e-6))))
-        ),
+        direction_sigma_deg=float(np.degrees(np.hypot(direction_sigma, swing))),
         matches=len(inliers.pair),
         pairs=len(np.unique(inliers.pair)),
         residual_deg=float(np.degrees(spread)),
+        rotation_sigmas_deg=np.degrees(sigmas),
     )
 
 
-def _lens_swing(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float) -> float:
-    """Return how far, radians, a lens model that is off turns the baseline's direction.
+def _lens_pose(
+    matches: RayMatches, R: FloatArray, d: FloatArray, spread: float
+) -> tuple[FloatArray, float]:
+    """Return how far, radians, a lens model that is off turns the rotation, about the axes of cam1
+    (3,), and the baseline's direction.
 
-    Rows of single pairs fit part of a distortion by a direction of the baseline, however many
-    matches there are. What they do not fit is left in the residuals over the image, so a bend that
+    Rows of single pairs fit part of a distortion by a yaw and a direction of the baseline, however
+    many matches there are. What they do not fit is left in the residuals over the image, so a bend that
     leaves more there than is seen is taken as that much smaller.
     """
     angles = epipolar_angles(R, d, matches)
     cells = _cells(_angles(matches.ray0))
     seen = _structure(angles, cells)
     swings = []
+    turns = []
     for bend in _bends(matches.ray0):
         for sign in (1.0, -1.0):
             bent = replace(matches, ray0=_bent(matches.ray0, sign * bend))
             refit = _fit_stereo(bent, R, d, spread)
             left = _structure(epipolar_angles(*refit, bent) - angles, cells)
-            swings.append(min(1.0, seen / max(left, 1e-12)) * np.linalg.norm(np.cross(d, refit[1])))
-    return float(np.sqrt(0.5 * np.sum(np.square(swings))))  # the two signs are one distortion
+            share = min(1.0, seen / max(left, 1e-12))
+            swings.append(share * np.linalg.norm(np.cross(d, refit[1])))
+            turns.append(share * so3_log(refit[0] @ R.T))
+    # the two signs are one distortion
+    return np.sqrt(0.5 * np.sum(np.square(turns), axis=0)), float(
+        np.sqrt(0.5 * np.sum(np.square(swings)))
+    )
 
 
 def _cells(angles: FloatArray) -> IntArray:

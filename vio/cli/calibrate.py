@@ -223,11 +223,14 @@ def _stereo_rows(stereo: StereoEstimate) -> _Rows:
 
     x, y, z = np.degrees(so3_log(stereo.R_cam1_cam0))
     (u, v, w) = stereo.direction
-    sigma_deg = stereo.rotation_sigma_deg
+    sigmas = stereo.rotation_sigmas_deg
+    sigma = f"{stereo.rotation_sigma_deg:.4f}"
+    if sigmas is not None:
+        sigma = " ".join(f"{each:.4f}" for each in sigmas)
     return [
         (
             "left-right rotation",
-            f"{x:+.4f} {y:+.4f} {z:+.4f} deg (cam0 to cam1), sigma {sigma_deg:.4f}",
+            f"{x:+.4f} {y:+.4f} {z:+.4f} deg (cam0 to cam1), sigma {sigma}",
         ),
         (
             "baseline direction",

@@ -133,9 +133,12 @@ def columns(text: str) -> tuple[str, ...]:
 
 def execute(args: argparse.Namespace) -> int:
     _check_plot(args)
-    estimates = {str(path): _read(path) for path in args.estimates}
+    estimates = {path: _read(path) for path in args.estimates}
     reference = _read(args.reference)
-    results = {name: _evaluated(args, estimate, reference) for name, estimate in estimates.items()}
+    results = {
+        str(path): _evaluated(args, estimate, _numbered(path, reference))
+        for path, estimate in estimates.items()
+    }
     if args.plot is not None:
         from vio.runs.picture import Compared, draw_comparison, write_picture
 
@@ -284,6 +287,18 @@ def _drift_rows(drift: KittiError) -> Iterator[tuple[str, str]]:
                 f"  {row.length_m:g} m",
                 f"{row.t_err_percent:8.3f} % {turned:>19} {row.segments:6d} segments",
             )
+
+
+def _numbered(
+    estimate: Path, reference: tuple[Trajectory, FloatArray | None]
+) -> tuple[Trajectory, FloatArray | None]:
+    """Return a reference numbered by the frames of the recording that an estimate is of, where its
+    run knows the numbers of the images.
+    """
+    from vio.evaluation.numbering import numbered_by_images
+    from vio.runs.stated import read_image_numbers
+
+    return numbered_by_images(reference[0], read_image_numbers(estimate)), reference[1]
 
 
 def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:

@@ -28,7 +28,8 @@ from vio.datasets.tables import (
     read_velocity_table,
 )
 from vio.datasets.unused import Layout, unused_note
-from vio.errors import CalibrationError, DataError
+from vio.errors import CalibrationError, DataError, EvaluationError
+from vio.evaluation.numbering import numbered_by_images
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.imu.clocks import judge_clocks
@@ -174,6 +175,9 @@ class ReadImages:
     notes: Sequence[str]  # about images and times
     used: Sequence[Path]  # further files and folders that were read, or are known not to matter
     has_depths: bool = False  # whether one camera has depth images
+    numbers: IntArray | None = (
+        None  # (F,) in the names of the images; None: they do not count frames
+    )
 
 
 def read_companions(
@@ -202,7 +206,7 @@ def read_companions(
         )
     reference_file = None
     if reference is None:
-        reference, reference_file = _read_reference(layout, rig, rectifier, times_ns)
+        reference, reference_file = _read_reference(images, rig, rectifier)
     read = [source for source in (file, times_file, reference_file) if source is not None]
     beside = Beside(
         motion,
@@ -213,7 +217,8 @@ def read_companions(
         [file] * len(rig.cameras),
     )
     has_body = rig.T_cam0_imu is not None and (rig.cam1 is not None or len(motion_files) > 0)
-    return parts_of(images.kind, layout, rectifier, settings, times_ns, beside, has_body=has_body)
+    parts = parts_of(images.kind, layout, rectifier, settings, times_ns, beside, has_body=has_body)
+    return (replace(parts[0], image_numbers=images.numbers), *parts[1:])
 
 
 def _with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Path]]:
@@ -317,27 +322,52 @@ def _other_imu_notes(layout: Layout) -> list[str]:
 
 
 def _read_reference(
-    layout: Layout, rig: Rig, rectifier: Rectifier, times_ns: IntArray
+    images: ReadImages, rig: Rig, rectifier: Rectifier
 ) -> tuple[Trajectory | None, Path | None]:
     """Read the ground truth as that of the body: the IMU, or the rectified left camera where
     there is none.
     """
+    layout = images.layout
     bases = (layout.root, layout.base, layout.root / "dso")
     file = next((f for n in _REFERENCES for base in bases if (f := base / n).is_file()), None)
     if file is None:
         return None, None
     truth = read_trajectory(file)
     if truth.times_ns is None:
-        if len(truth) > len(times_ns):
-            raise DataError(
-                f"{file} holds {len(truth)} poses for {len(times_ns)} pairs; give one line for "
-                "each pair"
-            )
-        truth = replace(truth, times_ns=times_ns[: len(truth)], frame_indices=np.arange(len(truth)))
+        truth = reference_of_images(truth, images.times[0], images.numbers, file)
     if is_pair_of_eth3d(layout):
         truth = truth_of_left(truth, rig)
     with naming(file):
         return reference_of_body(truth, rig, rectifier), file
+
+
+def reference_of_images(
+    truth: Trajectory, times_ns: IntArray, image_numbers: IntArray | None, file: Path
+) -> Trajectory:
+    """Return ground truth without times with those of the frames that its poses belong to.
+
+    Args:
+        truth: a pose for each image, or for each number of an image.
+        times_ns: of the frames (F,).
+        image_numbers: (F,) by which the images are named; None: not known.
+        file: of the ground truth, for messages.
+
+    Raises:
+        DataError: there are more poses than images that follow one another from the first, or which
+            images they are of is not known.
+    """
+    counted = image_numbers is None or int(image_numbers[-1]) <= len(times_ns)
+    if len(truth) > len(times_ns) and counted:
+        raise DataError(
+            f"{file} holds {len(truth)} poses for {len(times_ns)} images; give one line for each "
+            "image"
+        )
+    try:
+        truth = numbered_by_images(truth, image_numbers)
+    except EvaluationError as error:
+        raise DataError(f"{file}: {error}") from error
+    assert truth.frame_indices is not None
+    return replace(truth, times_ns=times_ns[truth.frame_indices])
 
 
 def imu_on_camera_clock(

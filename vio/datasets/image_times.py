@@ -32,6 +32,8 @@ from vio.records import NS_PER_S, IntArray
 _LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
 _SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
+_LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
+_TIMED = 100  # images, of which names that are times show it
 _LIST_FORM = "timestamp [ns], filename"
 _NUMBER = r"\d+(?:\.\d*)?(?:[eE][+-]?\d+)?"
 # `cam0_1403636579763555584`, `1403636579763555584_left`, `1700000001.33713`, `17000000013371ms`,
@@ -338,6 +340,25 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
         "so speeds are unknown; write one time an image (seconds or nanoseconds) into times.txt"
     )
     return counts * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
+
+
+def numbers_in_names(pairs: ImagePairs) -> IntArray | None:
+    """Return the numbers (F,) by which left images are named where they count frames, that is
+    increase and are no times; None: they do not.
+    """
+    files = pairs.left if isinstance(pairs, FilePairs) else [left for left, _ in pairs]
+    names = files.names if isinstance(files, ImageFiles) else [file.name for file in files]
+    stems = [stem_of(name) for name in names]
+    if all(map(str.isdecimal, stems)):
+        numbers = list[int | str](map(int, stems))
+    else:
+        numbers = list(map(_last_number, files))
+    counted = [number for number in numbers if isinstance(number, int)]
+    if len(counted) < len(numbers) or max(counted, default=0) >= _LARGEST_COUNT:
+        return None
+    found = np.array(counted, dtype=np.int64)
+    increase = len(found) > 0 and bool((found[1:] > found[:-1]).all())
+    return found if increase and _name_times(files[:_TIMED]) is None else None
 
 
 def _frame_counts(files: Sequence[Path]) -> IntArray:

@@ -27,6 +27,7 @@ from vio.datasets.samples import motion_samples as as_arrays
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_bytes
+from vio.files.stamps import FRAME_PACE, SAMPLE_PACE
 from vio.files.text import check_increasing
 from vio.geometry.lie import FloatArray, checked_transform
 from vio.geometry.stereo import CameraKind, Projection, StereoCamera
@@ -71,6 +72,7 @@ _OPTIONAL: dict[str, tuple[str, int]] = {
     "run_motion": ("U", 0),
     "camera_kind": ("U", 0),
     "residual_px": ("f", 0),
+    "image_numbers": ("i", 1),
     "sigma": ("f", 2),
     "T_cam0_imu": ("f", 2),
     "reference_T_world_body": ("f", 3),
@@ -133,6 +135,7 @@ def write_observation_log(
         "T_cam0_imu": recording.T_cam0_imu,
         **_reference_entries(recording),
         "run_motion": run_motion,
+        "image_numbers": recording.image_numbers,
     }
     arrays = {key: np.asarray(value) for key, value in entries.items() if value is not None}
     stream = io.BytesIO()
@@ -210,7 +213,8 @@ def write_observations(
         reference: ground truth, for the errors of a run.
 
     Raises:
-        DataError: times or features are malformed, or the file cannot be written.
+        DataError: times or features are malformed, times are closer than those of any sensor (frame
+            numbers, milliseconds), or the file cannot be written.
         CalibrationError: the extrinsics are no rigid transform.
     """
     if isinstance(camera, Rig):
@@ -224,9 +228,11 @@ def write_observations(
             "in nanoseconds, for each"
         )
     times_ns = check_increasing(times_ns.astype(np.int64), lambda k: f"frame times, entry {k}")
+    samples = as_arrays(motion)
+    if fault := FRAME_PACE.fault(times_ns) or SAMPLE_PACE.fault(samples.times_ns):
+        raise DataError(fault)
     seen = [frame_observations(k, int(times_ns[k]), *frame) for k, frame in enumerate(frames)]
     T = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
-    samples = as_arrays(motion)
     recording = Recording(
         "features", Path(path), camera, T, times_ns, False, samples.kinds, reference
     )
@@ -269,6 +275,7 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
         landmarks_reference=_landmarks(arrays),
         notes=tuple(str(note) for note in arrays["notes"]),
         run_motion=cast(RunMotion, str(arrays["run_motion"])) if "run_motion" in arrays else None,
+        image_numbers=arrays.get("image_numbers"),
     )
     return FeatureDataset(recording, tracks, motion, frames)
 
@@ -363,9 +370,14 @@ def _of_times(arrays: Mapping[str, np.ndarray]) -> str | None:
         frames[0] < 0 or frames[-1] >= len(times_ns) or (np.diff(frames) <= 0).any()
     ):
         return f"frame numbers do not increase within 0 to {len(times_ns) - 1}"
+    numbers = arrays.get("image_numbers", frames[:0])
+    if len(numbers) not in (0, len(times_ns)) or (np.diff(numbers) <= 0).any():
+        return (
+            f"{len(numbers)} numbers of images for {len(times_ns)} frames, or they do not increase"
+        )
     if arrays["motion_values"].shape != (samples, 6) or len(arrays["motion_is_imu"]) != samples:
         return f"{samples} motion times, but values {arrays['motion_values'].shape}"
-    return None
+    return FRAME_PACE.fault(times_ns)
 
 
 def _of_camera(arrays: Mapping[str, np.ndarray]) -> str | None:

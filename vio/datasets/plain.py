@@ -31,11 +31,18 @@ from vio.datasets.companions import (
     find_calibration_of,
     imu_files,
     read_companions,
+    reference_of_images,
 )
 from vio.datasets.euroc import is_euroc_folder, read_euroc
 from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
-from vio.datasets.image_times import counted_apart, frame_times, pair_files, times_of
+from vio.datasets.image_times import (
+    counted_apart,
+    frame_times,
+    numbers_in_names,
+    pair_files,
+    times_of,
+)
 from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
 from vio.datasets.kitti import DRIVE_NS
 from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
@@ -348,10 +355,11 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     times_ns = times_of(times_file, pairs, doubts)
     notes = (*notes, *doubts)
     poses = _poses_file(path)
-    reference = None if poses is None else _read_reference(poses, times_ns, T_left_cam0)
+    numbers = numbers_in_names(pairs)
+    reference = None if poses is None else _read_reference(poses, times_ns, numbers, T_left_cam0)
     used = [] if poses is None else [poses]
     times = times_ns, times_file
-    read = ReadImages("kitti", layout, (file, rig), times, notes, used)
+    read = ReadImages("kitti", layout, (file, rig), times, notes, used, numbers=numbers)
     parts = read_companions(read, settings, reference)
     return ImageDataset(*parts, pairs, levels=levels)
 
@@ -393,7 +401,8 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
     else:
         times_ns = numbers * DRIVE_NS
         notes = (f"{used[0]} is missing; times follow from the frame numbers at 10 Hz", *notes)
-    read = ReadImages("kitti_raw", layout, (file, rig), (times_ns, used[0]), notes, used)
+    times = (times_ns, used[0])
+    read = ReadImages("kitti_raw", layout, (file, rig), times, notes, used, numbers=numbers)
     parts = read_companions(read, settings)
     return ImageDataset(*parts, pairs, levels=levels)
 
@@ -480,7 +489,8 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
     times = (times_ns, times_file)
     notes = (*images.notes, *notes)
     has_depths = images.depths is not None
-    read = ReadImages(kind, layout, (file, rig), times, notes, used, has_depths=has_depths)
+    numbers = numbers_in_names(images.pairs)
+    read = ReadImages(kind, layout, (file, rig), times, notes, used, has_depths, numbers)
     parts = read_companions(read, settings)
     dataset = ImageDataset(
         *parts,
@@ -552,22 +562,17 @@ def _poses_file(path: Path) -> Path | None:
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
-def _read_reference(file: Path, times_ns: IntArray, T_left_cam0: FloatArray) -> Trajectory:
+def _read_reference(
+    file: Path, times_ns: IntArray, image_numbers: IntArray | None, T_left_cam0: FloatArray
+) -> Trajectory:
     """Read the ground truth of camera 0 and move it, and the world, to the left camera; identity
     stays identity.
     """
-    poses = read_trajectory(file, fmt="kitti").T_world_body
-    if len(poses) > len(times_ns):
-        raise DataError(
-            f"{file} holds {len(poses)} poses for {len(times_ns)} images; give one line for each "
-            "image"
-        )
-    moved = (
-        T_left_cam0 @ poses @ se3_inverse(T_left_cam0)
-        if np.any(T_left_cam0 != np.eye(4))
-        else poses
-    )
-    return Trajectory(moved, times_ns[: len(poses)], "cam0", np.arange(len(poses)))
+    truth = read_trajectory(file, fmt="kitti")
+    if np.any(T_left_cam0 != np.eye(4)):
+        moved = T_left_cam0 @ truth.T_world_body @ se3_inverse(T_left_cam0)
+        truth = replace(truth, T_world_body=moved)
+    return reference_of_images(truth, times_ns, image_numbers, file)
 
 
 def _depth_factor(

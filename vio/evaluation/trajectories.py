@@ -250,6 +250,7 @@ def evaluate(
                 moved,
                 reference,
             ),
+            *(_row_note(moved, reference) if association == "frame" else ()),
             *order_notes,
             *(
                 _positions_alone(estimate, reference)
@@ -376,6 +377,26 @@ def _notes(
             "is it the reference of this recording, on the same clock?"
         )
     return tuple(notes)
+
+
+def _row_note(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
+    """Doubt that rows are frames where a trajectory states neither frames nor times, and has more or
+    fewer poses than the other has frames.
+    """
+    named = {"estimate": estimate, "reference": reference}
+    bare = [name for name, t in named.items() if t.times_ns is None and t.frame_indices is None]
+    ends = {
+        name: len(t) if t.frame_indices is None else int(t.frame_indices[-1]) + 1
+        for name, t in named.items()
+    }
+    if not bare or ends["estimate"] == ends["reference"]:
+        return ()
+    which = " and the ".join(bare)
+    return (
+        f"row k of the {which} is taken for frame k, for want of times; the estimate has "
+        f"{ends['estimate']} frames and the reference {ends['reference']}: where images were lost, "
+        "errors are false; give both with times (TUM form)",
+    )
 
 
 def _positions_alone(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:

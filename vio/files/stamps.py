@@ -33,6 +33,7 @@ _SIZES: tuple[tuple[TimeUnit, Decimal], ...] = (
     ("ms", Decimal("1e11")),
 )
 _DECADES = 1000.0  # between two units
+_FEWEST_STEPS = 2  # which tell a unit: two frames may share an arrival
 _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{1,12})\.(\d{1,9})")
 
 
@@ -49,6 +50,16 @@ class Pace:
     def believes(self, apart_s: float) -> bool:
         """Tell whether entries of the kind may be this far apart."""
         return self.least_s <= apart_s <= self.most_s
+
+    def fault(self, times_ns: IntArray) -> str | None:
+        """Return why times (N,) are no nanoseconds; None: they may be, or are too few to tell."""
+        steps = times_ns[1:] - times_ns[:-1]
+        if len(steps) < _FEWEST_STEPS or steps.max() >= round(1e9 * self.least_s):
+            return None
+        return (
+            f"{self.what} come {int(np.median(steps))} ns apart, which no sensor does: their times are "
+            "numbers, milliseconds or microseconds; give integer nanoseconds"
+        )
 
 
 FRAME_PACE = Pace("frames", 1e-3, 5.0, 2e-3)

@@ -252,7 +252,7 @@ def tum_text(
     if body is not None:
         lines.append(f"# body: {body}")
         if frames is not None and len(frames):
-            lines.append(f"# frames: {_format_frames(frames)}")
+            lines.append(f"# frames: {frames_text(frames)}")
         lines.append("# timestamp tx ty tz qx qy qz qw")
     values = np.concatenate(
         [T_world_body[:, :3, 3], quat_xyzw_from_rotation(T_world_body[:, :3, :3])], axis=1
@@ -279,7 +279,7 @@ def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
         )
     frames = trajectory.frame_indices
     if frames is not None and not np.array_equal(frames, np.arange(len(trajectory))):
-        text = _format_frames(frames)
+        text = frames_text(frames)
         if len(text) > _COMMENTS.max_list_characters:
             text = f"{frames[0]} to {frames[-1]} with gaps, {len(frames)} in all"
         logger.warning(
@@ -516,7 +516,7 @@ def _body(table: _Table, header_body: str | None, requested: BodyFrame | None) -
     return "cam0" if header_body == "cam0" else "imu" if header_body == "imu" else None
 
 
-def _format_frames(frames: IntArray) -> str:
+def frames_text(frames: IntArray) -> str:
     """Format frame numbers as ranges: [0 1 2 5] becomes '0-2 5-5', and [0 2 4], every second
     frame, '0-4/2'.
     """
@@ -538,7 +538,7 @@ def _format_frames(frames: IntArray) -> str:
 
 
 def _parse_frames(table: _Table, text: str) -> IntArray:
-    spans = _frame_spans(text)
+    spans = frame_spans(text)
     if spans is None or sum(map(len, spans)) != len(table.rows):
         raise DataError(
             f"{table.path}: its comment '# frames: {text[:60]}' does not number its "
@@ -550,7 +550,7 @@ def _parse_frames(table: _Table, text: str) -> IntArray:
     )
 
 
-def _frame_spans(text: str) -> list[range] | None:
+def frame_spans(text: str) -> list[range] | None:
     """Return the ranges that a text such as `0-41 45-99/2` names; None: they do not increase, or it
     is no such text.
     """

@@ -202,7 +202,7 @@ class Msckf(Backend):
         if window.clones and not len(seen):
             # A frame that shows nothing ends no track; what is seen next decides.
             propagation.blind = True
-            self._check_sane(window, observations.frame_index)
+            _check_sane(window, propagation.reported.own, self._source, observations.frame_index)
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         propagation.blind = False
         now = (window.nav, propagation.since_frame)
@@ -220,7 +220,7 @@ class Msckf(Backend):
             self._keep_first_yaw(window, before)
         except np.linalg.LinAlgError as error:
             raise DivergedError(_lost(observations.frame_index)) from error
-        self._check_sane(window, observations.frame_index)
+        _check_sane(window, propagation.reported.own, self._source, observations.frame_index)
         if report.used >= report.gated:
             self._good = GoodState(
                 observations.frame_index,
@@ -230,16 +230,6 @@ class Msckf(Backend):
                 window.calibration,
             )
         return report
-
-    def _check_sane(self, window: Window, frame_index: int) -> None:
-        """Raise DivergedError where the state, or what is reported of it, is not made of numbers, or
-        with an IMU of an impossible speed.
-        """
-        numbers = window.prior.P, window.nav.T_world_imu, self._propagation.reported.own
-        finite = all(np.isfinite(values).all() for values in numbers)
-        slow = self._source != "imu" or length(window.nav.velocity) < _MAX_SPEED_MPS
-        if not finite or not slow:
-            raise DivergedError(_lost(frame_index))
 
     def _begin(self, observations: Observations, seen: Observations) -> Window | None:
         """Begin the state at a frame; None: the frame passes."""
@@ -553,3 +543,16 @@ def _half_tangent(R: FloatArray) -> FloatArray:
     half = 0.5 * float(np.linalg.norm(phi))
     out: FloatArray = phi * (0.5 * np.tan(half) / half if half > 1e-6 else 0.5)
     return out
+
+
+def _check_sane(
+    window: Window, reported: FloatArray, source: MotionSource | None, frame_index: int
+) -> None:
+    """Raise DivergedError where the state, or its covariance as reported (D, D), is not made of
+    numbers, or with an IMU of an impossible speed.
+    """
+    numbers = window.prior.P, window.nav.T_world_imu, reported
+    finite = all(np.isfinite(values).all() for values in numbers)
+    slow = source != "imu" or length(window.nav.velocity) < _MAX_SPEED_MPS
+    if not finite or not slow:
+        raise DivergedError(_lost(frame_index))

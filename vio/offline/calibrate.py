@@ -350,7 +350,7 @@ def _measure_in_motion(
     source: CalibrationSource, stereo: StereoEstimate, tracks: FeatureTracks
 ) -> tuple[StereoEstimate, Intrinsics | NotObservable, SelfCalibration | None]:
     """Estimate the calibration by bundle adjustment over segments of video; unchanged where
-    there are none.
+    there are none, or the rig moves too little for them to tell more than single pairs.
     """
     assert source.dataset is not None
     width, height = source.image_size(tracks.z)
@@ -369,7 +369,7 @@ def _measure_in_motion(
                 return (
                     stereo,
                     NotObservable(
-                        _INTRINSICS, "there are no 20 frames in a row whose motion is known"
+                        _INTRINSICS, "there are no six frames in a row whose motion is known"
                     ),
                     None,
                 )
@@ -383,6 +383,8 @@ def _measure_in_motion(
         log.warning("the motion was not used: %s", error)
         return stereo, NotObservable(_INTRINSICS, "its bundle adjustment failed"), None
     R, direction, rotation_deg, direction_deg = held.right_camera()
+    if rotation_deg > _sigma_of_pairs_deg(stereo):
+        return stereo, NotObservable(_INTRINSICS, "the rig hardly moves"), None
     if (rotations := source.rectifying()) is not None:
         R_rect_cam0, R_rect_cam1 = rotations
         R = R_rect_cam1.T @ R @ R_rect_cam0
@@ -392,10 +394,18 @@ def _measure_in_motion(
         R_cam1_cam0=R,
         direction=direction,
         rotation_sigma_deg=rotation_deg,
+        rotation_sigmas_deg=None,
         direction_sigma_deg=direction_deg,
         segments=held.segments,
     )
     return found, intrinsics_of(camera, free), held
+
+
+def _sigma_of_pairs_deg(stereo: StereoEstimate) -> float:
+    """Return the standard deviation of a rotation by single pairs, with what a lens leaves of it."""
+    if stereo.rotation_sigmas_deg is None:
+        return stereo.rotation_sigma_deg
+    return max(stereo.rotation_sigma_deg, float(np.linalg.norm(stereo.rotation_sigmas_deg)))
 
 
 def _segments(
@@ -414,6 +424,7 @@ def _segments(
                 Segment(
                     T_world_cam0,
                     build_tracks(piece, keyframes, T_world_cam0, gate_px=_IN_MOTION.gate_px),
+                    frames=len(piece.trajectory),
                 )
             )
         except EstimationError as error:

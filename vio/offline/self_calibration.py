@@ -7,7 +7,8 @@ regions of the image say (a sandwich estimate clustered by region and segment), 
 model, of features that wander along edges and of moving objects are shared by all rows of a region.
 References: Triggs et al., Bundle adjustment: a modern synthesis (2000) for the elimination; Liang &
 Zeger, Longitudinal data analysis using generalized linear models, Biometrika (1986) for the
-covariance.
+covariance; Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage
+samples, Survey Methodology (2002) for the share of an error that a fit takes.
 """
 
 from __future__ import annotations
@@ -63,9 +64,10 @@ class _RefinementRules:
     """How a calibration is refined by its own images."""
 
     # What lens models leave, beside the scatter: this and the sliding window differ by so much on
-    # the same drives.
+    # the same drives. Over a shorter path it turns depths more.
     lens_deg: float = 0.01
     lens_direction_deg: float = 0.3
+    lens_frames: int = 36  # of pieces of which that was found
     held: Tolerance[float] = 1e-9  # standard deviation of what is not free
     max_steps: Tolerance[int] = 30  # of Levenberg-Marquardt
     min_damping: Tolerance[float] = 1e-10
@@ -78,6 +80,8 @@ class _RefinementRules:
     # of a point's information, against rounding; more of it passes for knowledge of depths
     rounding: Tolerance[float] = 1e-12
     cells: tuple[int, int] = (8, 4)  # regions of the image, along u and v
+    # of a region's error in any direction by the parameters, so that it can be told from what is left
+    most_taken: float = 0.95
     min_residual_px: Tolerance[float] = 0.02  # of exact tracks, so that weights stay finite
 
 
@@ -90,6 +94,7 @@ class Segment:
 
     T_world_cam0: FloatArray  # (K, 4, 4)
     tracks: PointTracks
+    frames: int  # of the piece
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +108,12 @@ class SelfCalibration:
     segments: int
     points: int
     residual_px: float  # robust standard deviation of a pixel coordinate
+    frames: int  # of the longest segment
+
+    @property
+    def lens_deg(self) -> float:
+        """What lens models leave of a rotation, as a standard deviation."""
+        return _REFINEMENT.lens_deg * max(_REFINEMENT.lens_frames / self.frames, 1.0)
 
     def right_camera(self) -> tuple[FloatArray, FloatArray, float, float]:
         """Return how the right camera lies as far as the image's centre determines it, with
@@ -131,7 +142,7 @@ class SelfCalibration:
         return (
             so3_exp(off[:3]),
             direction / np.linalg.norm(direction),
-            float(np.hypot(rotation, _REFINEMENT.lens_deg)),
+            float(np.hypot(rotation, self.lens_deg)),
             float(np.hypot(swing, _REFINEMENT.lens_direction_deg)),
         )
 
@@ -158,7 +169,7 @@ class SelfCalibration:
         z = project_off(camera, x, np.array([[0.0, 0.0, depth_m]]))[0]
         sigma = np.hypot(
             np.sqrt(gradient @ self.covariance @ gradient),
-            camera.fu * np.radians(_REFINEMENT.lens_deg),
+            camera.fu * np.radians(self.lens_deg),
         )
         return float(z[0] - z[2] - disparity_px), float(sigma)
 
@@ -298,14 +309,35 @@ def _with_covariance(
     prior = np.diag(1 / (width**2 + x**2))
     solved = [_normal_equations(camera, x, piece, sigma, 0.0) for piece in pieces]
     A = np.sum([n.A for n in solved], axis=0) + prior
-    scores = np.concatenate([n.scores for n in solved])
-    meat = _larger(scores.T @ scores * (len(scores) / max(len(scores) - 1, 1)) + prior, A)
+    scores = _as_before_the_fit(
+        np.concatenate([n.scores for n in solved]),
+        np.concatenate([n.information for n in solved]),
+        A,
+    )
+    meat = _larger(scores.T @ scores + prior, A)
     inverse = np.linalg.inv(A)
     covariance = np.asarray(inverse @ meat @ inverse, dtype=np.float64)
     allowed = width**2 + x**2
     sigmas = np.sqrt(np.minimum(np.diag(covariance), allowed))
     points = int(sum(len(piece.tracks.ids) for piece in pieces))
-    return SelfCalibration(x, sigmas, covariance, len(pieces), points, sigma)
+    frames = max(piece.frames for piece in pieces)
+    return SelfCalibration(x, sigmas, covariance, len(pieces), points, sigma, frames)
+
+
+def _as_before_the_fit(scores: FloatArray, information: FloatArray, A: FloatArray) -> FloatArray:
+    """Return scores (G, n) of regions, enlarged by what the parameters take of them.
+
+    A region that alone determines a parameter leaves no residual, whatever its error. The share
+    that is left of its scores is one less its information (G, n, n) over all of it, A (n, n).
+    """
+    L = np.linalg.cholesky(A)
+    whitened = np.linalg.solve(L, scores.T).T
+    half = np.linalg.solve(L, information)
+    taken = np.linalg.solve(L, np.swapaxes(half, 1, 2))
+    values, vectors = np.linalg.eigh(0.5 * (taken + np.swapaxes(taken, 1, 2)))
+    left = 1 - np.clip(values, 0.0, _REFINEMENT.most_taken)
+    parts = np.einsum("gji,gj->gi", vectors, whitened) / left
+    return np.einsum("gij,gj->gi", vectors, parts) @ L.T
 
 
 def _spread(camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment]) -> float:
@@ -372,6 +404,7 @@ class _Normal:
     A: FloatArray  # (18, 18)
     b: FloatArray  # (18,)
     scores: FloatArray  # (G, 18) contributions of regions of the image to b
+    information: FloatArray  # (G, 18, 18) and to A
     dp: tuple[FloatArray, FloatArray]  # steps of the points (3M,), by poses and parameters (3M, C)
     # steps of the poses (6(K-1),), by the parameters (6(K-1), 18)
     dpose: tuple[FloatArray, FloatArray]
@@ -385,7 +418,8 @@ class _Normal:
         T_cam0_world = se3_inverse(piece.T_world_cam0)
         T_cam0_world[1:] = se3_exp(dpose.reshape(-1, 6)) @ T_cam0_world[1:]
         p = piece.tracks.p_world + dp.reshape(-1, 3)
-        return Segment(se3_inverse(T_cam0_world), replace(piece.tracks, p_world=p))
+        tracks = replace(piece.tracks, p_world=p)
+        return replace(piece, T_world_cam0=se3_inverse(T_cam0_world), tracks=tracks)
 
 
 def _normal_equations(
@@ -432,7 +466,8 @@ def _normal_equations(
     H_pp += _REFINEMENT.rounding * np.trace(H_pp, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     H_pp[:, range(3), range(3)] *= 1 + damping
     H_cc[range(6 * K), range(6 * K)] *= 1 + damping
-    return _eliminated(H_pp, H_pc, g_p, g_c, H_cc, _regions(camera, tracks))
+    rows = _Rows(J_pose, J_x, J_p, tracks.point, tracks.keyframe)
+    return _eliminated(H_pp, H_pc, g_p, g_c, H_cc, _regions(camera, tracks), rows)
 
 
 def _sums(values: FloatArray, group: IntArray, groups: int) -> FloatArray:
@@ -532,6 +567,30 @@ def _regions(camera: StereoCamera, tracks: PointTracks) -> IntArray:
     return np.asarray(_REFINEMENT.cells[0] * row + column, dtype=np.int64)
 
 
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Weighted derivatives of the residuals of R rows."""
+
+    pose: FloatArray  # (R, 4, 6)
+    x: FloatArray  # (R, 4, 18)
+    p: FloatArray  # (R, 4, 3)
+    point: IntArray  # (R,)
+    keyframe: IntArray  # (R,)
+
+    def information(self, H_pp: FloatArray, gain: FloatArray) -> FloatArray:
+        """Return what each of M points tells of the parameters (M, 18, 18), with the points (M, 3, 3)
+        and the poses but the first eliminated, whose steps by the parameters are `-gain`.
+        """
+        by_pose = np.concatenate(
+            [np.zeros((1, 6, gain.shape[1])), gain.reshape(-1, 6, gain.shape[1])]
+        )
+        J = self.x - self.pose @ by_pose[self.keyframe]
+        Jt = np.swapaxes(J, 1, 2)
+        H_xx = _sums(Jt @ J, self.point, len(H_pp))
+        H_xp = _sums(Jt @ self.p, self.point, len(H_pp))
+        return np.asarray(H_xx - H_xp @ np.linalg.solve(H_pp, np.swapaxes(H_xp, 1, 2)))
+
+
 def _eliminated(
     H_pp: FloatArray,
     H_pc: FloatArray,
@@ -539,6 +598,7 @@ def _eliminated(
     g_c: FloatArray,
     H_cc: FloatArray,
     region: IntArray,
+    rows: _Rows,
 ) -> _Normal:
     """Eliminate points, then poses; the first pose is held."""
     M, _, C = H_pc.shape
@@ -560,6 +620,7 @@ def _eliminated(
         A=S[np.ix_(params, params)] - S[np.ix_(params, poses)] @ gain,
         b=g[params] - gain.T @ g[poses],
         scores=(regions[:, params] - regions[:, poses] @ gain)[kept],
+        information=_sums(rows.information(H_pp, gain), region, len(regions))[kept],
         dp=(
             np.asarray(own.ravel(), dtype=np.float64),
             np.asarray(by_c.reshape(3 * M, C)[:, 6:], dtype=np.float64),

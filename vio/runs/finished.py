@@ -16,6 +16,7 @@ import numpy as np
 
 from vio.config import Config, describe, load_config
 from vio.errors import ConfigError, DataError, EvaluationError
+from vio.evaluation.numbering import numbered_by_images
 from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.inputs import read_input
 from vio.files.tables import Rows
@@ -26,7 +27,7 @@ from vio.numerics.kinds import Capacity
 from vio.records import LoopEvent, MapKeyframes, Trajectory
 from vio.runs.files import RunFile
 from vio.runs.mapped import read_keyframes, read_lines, read_loops
-from vio.runs.stated import read_metrics
+from vio.runs.stated import read_image_numbers, read_metrics
 from vio.runs.tables import ESTIMATE
 
 log = logging.getLogger(__name__)
@@ -210,7 +211,8 @@ def _evaluation(
     if reference is None and not path.is_file():
         return None
     try:
-        return evaluate(trajectory, read_trajectory(path).numbered(), T_cam0_imu=T_cam0_body)
+        truth = numbered_by_images(read_trajectory(path), read_image_numbers(folder))
+        return evaluate(trajectory, truth, T_cam0_imu=T_cam0_body)
     except EvaluationError as error:
         log.warning("%s: the reference was not used: %s", path, error)
         return None

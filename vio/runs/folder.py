@@ -25,10 +25,11 @@ from vio.config import Config, describe, to_yaml
 from vio.dataclass import dataclass
 from vio.errors import CalibrationError, DataError, EvaluationError
 from vio.evaluation.errors_along_path import error_statistics, path_length_m
+from vio.evaluation.numbering import numbered_by_images
 from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.atomic import atomic_folder, check_own
 from vio.files.printable import json_text, printable
-from vio.files.trajectories import in_first_cam0, write_kitti, write_tum
+from vio.files.trajectories import frames_text, in_first_cam0, write_kitti, write_tum
 from vio.filters.rig_calibration import scale_sigma
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
@@ -331,7 +332,7 @@ def score(
     if reference is None:
         return None, None
     try:
-        truth = reference.numbered()
+        truth = numbered_by_images(reference, result.recording.image_numbers)
         poses = result.trajectory
         poses = poses if T_world_body is None else replace(poses, T_world_body=T_world_body)
         own = evaluate(poses, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
@@ -376,6 +377,7 @@ def metrics_of(
     work_ms = np.array([f.total_ms for f in frames])
     innovations = np.asarray(frames.column("innovation_ratio"), dtype=np.float64)
     scores = {} if evaluation is None else evaluation.as_dict()
+    numbers = result.recording.image_numbers
     return {
         "out": str(folder),
         "complete": result.stopped is None,
@@ -389,6 +391,7 @@ def metrics_of(
         "motion": result.motion or "none",
         "body": result.body,
         "frames": len(frames),
+        "image_numbers": None if numbers is None else frames_text(numbers),
         "first_frame": frames[0].index,
         "last_frame": frames[-1].index,
         "path_length_m": path_length_m(result.trajectory.positions),

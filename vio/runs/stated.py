@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +28,16 @@ from vio.files.schema import (
     a_list,
     an_object,
 )
-from vio.files.trajectories import read_trajectory
+from vio.files.trajectories import frame_spans, read_trajectory
 from vio.geometry.lie import FloatArray, checked_transform
 from vio.numerics.kinds import Capacity
-from vio.records import Trajectory
+from vio.records import IntArray, Trajectory
 from vio.runs.files import RunFile
 
 log = logging.getLogger(__name__)
 
 _MAX_BYTES: Capacity[int] = 2**26
+_MAX_FRAMES: Capacity[int] = 10**8  # of a recording: a month at 30 a second
 _NUMBERS = a_list(NUMBER)
 
 REQUEST_SHAPE = an_object(
@@ -142,7 +143,9 @@ METRICS_SHAPE = an_object(
         "T_cam0_imu": a_list(_NUMBERS),
         "complete": TRUTH,
         **dict.fromkeys(("source", "kind", "version"), TEXT),
-        **dict.fromkeys(("stopped", "backend", "motion", "body", "command"), TEXT_OR_NULL),
+        **dict.fromkeys(
+            ("stopped", "backend", "motion", "body", "command", "image_numbers"), TEXT_OR_NULL
+        ),
         **dict.fromkeys(("frames", "first_frame", "last_frame", "landmarks"), WHOLE),
         **dict.fromkeys(("innovation_ratio", "ate_m", "path_length_m"), NUMBER_OR_NULL),
         "warnings": a_list(TEXT, or_null=True),
@@ -182,9 +185,41 @@ def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
         DataError: the path contains no trajectory.
     """
     if not path.is_dir():
-        return read_trajectory(path), None
+        trajectory = read_trajectory(path)
+        beside = path.with_name(RunFile.TRAJECTORY)
+        if path.name == RunFile.TRAJECTORY_KITTI and beside.is_file():
+            numbered = read_trajectory(beside).frame_indices
+            if numbered is not None and len(numbered) == len(trajectory):
+                trajectory = replace(trajectory, frame_indices=numbered)
+        return trajectory, None
     _, T_cam0_imu = read_metrics(path)
     return read_trajectory(path / RunFile.TRAJECTORY), T_cam0_imu
+
+
+def read_image_numbers(path: Path) -> IntArray | None:
+    """Return by which numbers the images (F,) of a run's recording are named; None: a path that is no
+    run's folder or its trajectory, or no such names.
+
+    Raises:
+        DataError: the metrics are damaged.
+    """
+    folder = path if path.is_dir() else path.parent
+    of_run = path.is_dir() or path.name in (RunFile.TRAJECTORY, RunFile.TRAJECTORY_KITTI)
+    if not of_run or not (folder / RunFile.METRICS).is_file():
+        return None
+    text = read_stated(folder / RunFile.METRICS, METRICS_SHAPE, "repeat the run").get(
+        "image_numbers"
+    )
+    if text is None:
+        return None
+    spans = frame_spans(text)
+    if not spans or not 0 < sum(map(len, spans)) <= _MAX_FRAMES:
+        raise DataError(
+            f"{folder / RunFile.METRICS}: is damaged (image_numbers are {text[:60]!r}); repeat the run"
+        )
+    return np.concatenate(
+        [np.arange(span.start, span.stop, span.step, dtype=np.int64) for span in spans]
+    )
 
 
 def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
