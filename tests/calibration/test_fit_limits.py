@@ -365,7 +365,7 @@ def _refined(rotation_deg: float = 0.0, direction_deg: float = 0.0) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stereo, "_fit_stereo", lambda matches, R, d, spread: (R, d))
         patch.setattr(stereo, "_jackknife_sigmas", lambda *_: sigmas)
-        patch.setattr(stereo, "_lens_swing", lambda *_: 0.0)
+        patch.setattr(stereo, "_lens_pose", lambda *_: (np.zeros(3), 0.0))
         return stereo.refine_stereo(_matches(), np.eye(3), np.array([1.0, 0.0, 0.0]))
 
 
@@ -383,7 +383,7 @@ def _fitted(off_deg: float, which: int) -> bool:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stereo, "_fit_stereo", fit)
         patch.setattr(stereo, "_jackknife_sigmas", lambda *_: (0.0, 0.0))
-        patch.setattr(stereo, "_lens_swing", lambda *_: 0.0)
+        patch.setattr(stereo, "_lens_pose", lambda *_: (np.zeros(3), 0.0))
         stereo.refine_stereo(both, np.eye(3), np.array([1.0, 0.0, 0.0]))
     return counts[which] == 300
 

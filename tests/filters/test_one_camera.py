@@ -567,8 +567,9 @@ def test_an_accelerometer_in_g_is_named_before_the_start_that_it_prevents(
     (folder / "imu.csv").write_text("\n".join(["#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z", *rows]))
     assert main(["run", str(folder), "--out", str(tmp_path / "out")]) == 1
     lines = [m for m in caplog.messages if "accelerometer" in m or "no pose" in m]
-    assert "in g: multiply by 9.81" in lines[0]
-    assert "have no pose; correct the fault of the IMU" in lines[1]
+    assert "the IMU is in doubt: the accelerometer's median magnitude" in lines[0]
+    assert "in g: multiply by 9.81" in lines[1]
+    assert "have no pose; correct the fault of the IMU" in lines[2]
 
 
 def _shake(rng: np.random.Generator) -> FloatArray:

@@ -164,7 +164,7 @@ def _frames_are_listed(letters: int) -> bool:
     trajectory = Trajectory(np.tile(np.eye(4), (2, 1, 1)), None, "cam0", frames)
     with (
         TemporaryDirectory() as folder,
-        patch.object(files, "_format_frames", lambda frames: "a" * letters),
+        patch.object(files, "frames_text", lambda frames: "a" * letters),
         patch.object(files, "logger") as log,
     ):
         files.write_kitti(Path(folder, "a.txt"), trajectory)

@@ -139,11 +139,11 @@ def _is_linked(apart: int = 1, points: int = 100) -> bool:
 # Self-calibration
 
 
-def _known() -> self_calibration.SelfCalibration:
-    """A calibration that is known but for what lens models leave."""
+def _known(frames: int = 36) -> self_calibration.SelfCalibration:
+    """A calibration by so many frames that is known but for what lens models leave."""
     size = len(self_calibration.NAMES)
     none = np.zeros(size)
-    return self_calibration.SelfCalibration(none, none, np.zeros((size, size)), 1, 9, 0.1)
+    return self_calibration.SelfCalibration(none, none, np.zeros((size, size)), 1, 9, 0.1, frames)
 
 
 def _disparity_sigma_deg() -> float:
@@ -269,7 +269,7 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "check: time of two": (lambda x: _minutes_of_measured(2) < x, 1.03, 1.25),
     "keyframes: share": (lambda x: _least_share() < x, 0.8, 1.01),
     "keyframes: loops": (lambda n: _all_loops(int(n)), 59, 60),
-    "keyframes: piece": (lambda n: _is_piece(int(n)), 19, 20),
+    "keyframes: piece": (lambda n: _is_piece(int(n)), 4, 5),
     "keyframes: with an IMU": (lambda x: _steps_s() < x, 0.24, 0.26),
     "map: motion": (lambda x: not _is_one(x), 0.045, 0.055),
     "map: share of a motion": (lambda x: not _is_one(x, 10.0), 1.0, 1.1),
@@ -285,6 +285,7 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "COLMAP: linked": (lambda n: not _is_linked(int(n)), 6, 7),
     "COLMAP: shared": (lambda n: _is_linked(points=int(n)), 14, 15),
     "rig: lens": (lambda x: _disparity_sigma_deg() < x, 0.009, 0.011),
+    "rig: lens of few frames": (lambda n: _known(int(n)).lens_deg > _known(36).lens_deg, 36, 35),
     "rig: direction": (lambda x: _known().right_camera()[3] < x, 0.28, 0.32),
     "rig: residual": (lambda x: not _is_observable(x), 1.4, 1.6),
     "rig: half": (lambda x: _counts(x) < 0.5, 1.9, 2.1),
