@@ -21,6 +21,7 @@ from typing import Any
 from vio.bench.identity import ROOT
 from vio.errors import DataError, VioError
 from vio.files.atomic import lock_path
+from vio.numerics.kinds import Capacity
 
 try:
     import fcntl
@@ -29,7 +30,7 @@ except ImportError:  # Windows: two tasks may render the same; the second result
 
 log = logging.getLogger(__name__)
 RETRIES = 2  # of a process that was killed: memory may be free again by then
-_LAST_WORDS = 2000  # characters of stderr that a report of a crash is taken from
+_LAST_WORDS: Capacity[int] = 2000  # characters of stderr that a report of a crash is taken from
 _running: set[subprocess.Popen[str]] = set()
 _lock = threading.Lock()
 
