@@ -13,9 +13,10 @@ from typing import TypeAlias
 import numpy as np
 
 from tools.faults.changes import Period
+from vio.calibration.pair_rotation import turned_pixels
 from vio.datasets.features import FeatureDataset
 from vio.frontend.precomputed import with_right_of
-from vio.geometry.lie import FloatArray, so3_exp
+from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import Observations, Recording, feature_tracks, observations
 
@@ -88,8 +89,7 @@ def turned(degrees: float, axis: tuple[float, float, float]) -> ColumnChange:
         seen: Sequence[Observations], k: int, camera: StereoCamera, period: Period
     ) -> Observations:
         now = seen[k]
-        K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
-        H = K @ so3_exp(np.radians(degrees) * np.array(axis)) @ np.linalg.inv(K)
+        H = turned_pixels(camera, np.radians(degrees) * np.array(axis))
         rays: FloatArray = np.column_stack([now.z[:, 2:], np.ones(len(now))]) @ H.T
         z = now.z.copy()
         z[:, 2:] = rays[:, :2] / rays[:, 2:]

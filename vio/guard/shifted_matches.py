@@ -32,7 +32,7 @@ from vio.guard.match_check import (
 )
 from vio.numerics.compiled import solve_positive
 from vio.numerics.kinds import Tolerance
-from vio.numerics.robust import median
+from vio.numerics.robust import median, robust_sigma
 from vio.records import Observations, SigmaArray
 
 
@@ -156,7 +156,7 @@ def common_change(camera: StereoCamera, shared: SharedMatches) -> tuple[float, f
     fitted: FloatArray = np.array([median(change), 0.0, 0.0, 0.0, 0.0])
     for _ in range(_SHIFT.steps):
         residuals = change - terms @ fitted
-        noise_px = max(1.4826 * median(np.abs(residuals)), _MIN_NOISE_PX)
+        noise_px = max(robust_sigma(residuals), _MIN_NOISE_PX)
         normal = _PRECISIONS * noise_px**2
         moment: FloatArray = np.zeros(len(fitted))
         add_equations(terms, change, fitted, 2.0 * noise_px, normal, moment)

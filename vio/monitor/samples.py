@@ -91,8 +91,7 @@ class Samples:
         """Check the readings since the last call for gaps and clipping, and keep or drop them."""
         if len(self._new) < 2:
             return []
-        times = np.array([s.time_ns for s in self._new], dtype=np.int64)
-        values = np.array([[*s.gyro, *s.accel] for s in self._new])
+        times, values = self._unchecked()
         before = self._times[-1][-1:] if self._times else times[:0]
         steps = np.diff(np.concatenate([before, times])) * S_PER_NS
         found = [*_gap(times, steps, self.step_s), *_saturation(times, values)]
@@ -112,9 +111,13 @@ class Samples:
         times, values = self.table()
         if not self._new:
             return times, values
-        new = np.array([s.time_ns for s in self._new], dtype=np.int64)
-        readings = np.array([[*s.gyro, *s.accel] for s in self._new])
+        new, readings = self._unchecked()
         return np.concatenate([times, new]), np.concatenate([values, readings])
+
+    def _unchecked(self) -> tuple[IntArray, FloatArray]:
+        """Return times (S,) and readings (S, 6) that were not checked yet, of which there are some."""
+        times = np.array([s.time_ns for s in self._new], dtype=np.int64)
+        return times, np.array([[*s.gyro, *s.accel] for s in self._new])
 
     def table(self) -> tuple[IntArray, FloatArray]:
         """Return times (S,) and readings (S, 6) [gyro; accel]."""
