@@ -210,6 +210,76 @@ def test_live_estimates_are_right_once_the_unit_is_known(as_recorded: RunResult)
     assert np.linalg.norm(apart) < 0.01
 
 
+def _with_clock(flight: _Features, offset_ms: float, since: float = 0.0) -> _Features:
+    """The flight, with the IMU's clock ahead from a share of its time on."""
+    times_ns = flight.recording.frame_times_ns
+    since_ns = times_ns[0] + since * (times_ns[-1] - times_ns[0])
+    moved_ns = round(1e6 * offset_ms)
+    samples = [
+        replace(s, time_ns=s.time_ns + moved_ns * int(s.time_ns >= since_ns))
+        for s in flight.samples
+    ]
+    return replace(flight, samples=samples)
+
+
+@pytest.mark.parametrize("offset_ms", [-180.0, -500.0, 140.0, 300.0])
+def test_images_alone_go_on_where_clocks_are_further_apart_than_a_filter_can_find(
+    offset_ms: float, alone: Trajectory
+) -> None:
+    result = _run(_with_clock(_flight(), offset_ms))
+    assert _worst_m(result.trajectory, alone) < 0.001
+    line = [line for line in result.warnings if "estimated again" in line][-1]
+    assert "the IMU is not used, and images alone go on" in line
+
+
+def test_clocks_that_are_apart_by_less_are_the_filters_to_find(as_recorded: RunResult) -> None:
+    result = _run(_with_clock(_flight(), 50.0))
+    assert not [line for line in result.warnings if "estimated again" in line]
+    assert result.estimates[-1].time_offset_s == pytest.approx(0.05, abs=0.005)
+    assert _worst_m(result.trajectory, as_recorded.trajectory) < 0.01
+
+
+@pytest.fixture
+def long_flight(monkeypatch: pytest.MonkeyPatch) -> tuple[_Features, Trajectory]:
+    """20 s of flight, and its trajectory by images alone."""
+    monkeypatch.setattr("tests.live.test_imu_trial.FRAMES", 400)
+    flight = _flight()
+    return flight, _run(flight, "none").trajectory
+
+
+def test_images_alone_go_on_where_a_clock_has_jumped(
+    long_flight: tuple[_Features, Trajectory],
+) -> None:
+    """The filter holds on to the offset that it was certain of, and takes the jump for the gyro's."""
+    flight, alone = long_flight
+    result = _run(_with_clock(flight, 80.0, 0.25))
+    assert _worst_m(result.trajectory, alone) < 0.001
+    (finding,) = [f for f in result.findings if f.code == "estimate-implausible"]
+    assert "a clock has jumped" in finding.message
+
+
+def test_a_clock_that_has_jumped_after_the_first_minute_ends_in_a_new_start(
+    long_flight: tuple[_Features, Trajectory], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the offset that the rates show, which the new filter keeps."""
+    monkeypatch.setattr("vio.live.imu_trial._MAX_FRAMES", 100)
+    flight, alone = long_flight
+    result = _run(_with_clock(flight, 80.0, 0.25))
+    (found,) = [f for f in result.findings if f.code == "estimate-implausible"]
+    (anew,) = [f for f in result.findings if f.code == "estimate-restarted"]
+    assert found.first_frame is not None
+    levels = result.estimates
+    assert all(levels[k].integrity == "unusable" for k in range(found.first_frame, anew.frame))
+    assert levels[399].integrity == "nominal"
+    assert levels[399].time_offset_s == pytest.approx(0.08, abs=0.005)
+    first = np.linalg.inv(alone.T_world_body[anew.frame]) @ alone.T_world_body[399]
+    begun = levels[anew.frame].T_world_imu, levels[399].T_world_imu
+    moved = np.linalg.inv(begun[0]) @ begun[1]
+    assert np.linalg.norm(moved[:3, 3] - first[:3, 3]) < 0.1
+    off = np.abs(begun[1][:3, 3] - alone.positions[399])
+    assert np.all(off < 3.0 * np.sqrt(np.diag(levels[399].covariance)[:3]))
+
+
 @pytest.mark.parametrize(
     ("fault", "factor", "certain", "expected"),
     [
@@ -227,6 +297,12 @@ def test_verdict_follows_from_what_is_certain(
 ) -> None:
     finding = InertialFinding(fault, "", "", certain=certain, factor=factor)  # type: ignore[arg-type]
     assert ImuVerdict().after(finding) == expected
+
+
+@pytest.mark.parametrize(("offset_s", "usable"), [(0.09, True), (-0.09, True), (0.13, False)])
+def test_clocks_far_apart_leave_nothing_of_an_imu(offset_s: float, usable: bool) -> None:
+    finding = InertialFinding("clocks apart", "", "", offset_s=offset_s)
+    assert ImuVerdict().after(finding) == ImuVerdict(usable=usable)
 
 
 def test_images_carry_on_by_the_depths_of_before_when_the_right_camera_fails(

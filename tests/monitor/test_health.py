@@ -157,3 +157,27 @@ def test_reports_an_implausible_state_once(more: dict[str, object], message: str
     assert message in finding.message
     assert finding.message.endswith("calibration, units and clocks")
     assert health.frame(2, GOOD, _estimate(2, **more)) == ()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("off_s", "sigma_s", "found"),
+    [(0.017, 0.0, 0), (-0.025, 0.0, 1), (0.025, 0.004, 0), (0.04, 0.004, 1), (0.3, None, 1)],
+)
+def test_an_offset_of_clocks_that_the_rates_contradict_is_implausible(
+    off_s: float, sigma_s: float | None, found: int
+) -> None:
+    """Beyond what the rates can tell, and three of the filter's own standard deviations."""
+    health = RunHealth()
+    estimate = _estimate(30, time_offset_s=0.05, time_offset_sigma_s=sigma_s)
+    assert health.clock(30, estimate, None, 12) == []
+    findings = health.clock(30, estimate, 0.05 - off_s, 12)
+    assert [(f.code, f.frame, f.first_frame, f.lasts) for f in findings] == [
+        ("estimate-implausible", 30, 12, True)
+    ] * found
+    assert health.clock(31, estimate, 0.05 - off_s, 12) == []
+    health.begun_anew(32, estimate.time_ns, estimate)
+    assert len(health.clock(32, estimate, 0.05 - off_s, 12)) == found
+
+
+def test_an_offset_that_is_not_estimated_is_not_judged() -> None:
+    assert RunHealth().clock(30, _estimate(30), 0.3, 12) == []

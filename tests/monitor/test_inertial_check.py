@@ -470,10 +470,11 @@ def test_reports_both_degrees_and_inverted_extrinsics() -> None:
 
 def test_estimates_the_clock_offset() -> None:
     it = _recording("room")
-    for seconds in (0.05, -1.3):
+    for seconds in (0.05, 0.13, -1.3):
         found = _watch(it, samples=_shifted(it, seconds))
         assert _faults(found) == ["clocks apart"]
-        assert f"{seconds:+.3f} s" in found[0].explanation
+        assert found[0].offset_s == pytest.approx(seconds, abs=0.002)
+        assert f"{found[0].offset_s:+.3f} s" in found[0].explanation
     assert _watch(it, samples=_shifted(it, 0.005)) == []
 
 

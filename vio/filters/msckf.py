@@ -155,6 +155,12 @@ class Msckf(Backend):
         else:  # a velocity moves the state at once, and what is wrong is named by its own sample
             super().propagate_all(samples)
 
+    def begin_with_offset(self, time_offset_s: float) -> None:
+        """Take by how much later than its stamp a frame was exposed, on the IMU's clock, before the
+        state begins; it stays as uncertain as the settings say.
+        """
+        self._calibration = replace(self._calibration, time_offset_s=time_offset_s)
+
     def take_rotation_comparison(self, comparison: RotationComparison | None) -> None:
         """Take how the camera's rotation compares with the gyro's; None: they were not compared
         yet.

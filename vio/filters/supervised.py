@@ -190,12 +190,14 @@ class SupervisedMsckf(Backend):
         """Replace a filter whose state has become impossible by a new one, see `Backend`.
 
         The new filter takes the samples and frames of the last seconds, so it has a window already.
-        Its tilt is the accelerometer's; position and yaw are those of `good`, with the uncertainty
-        of what the rig may have done since.
+        Its tilt is the accelerometer's; position, yaw and the clocks' offset are those of `good`,
+        the former with the uncertainty of what the rig may have done since.
         """
         if self._stand_in is not None:
             return None
         new = self._new()
+        if good.time_offset_s is not None:
+            new.begin_with_offset(good.time_offset_s)
         frame = self._give_recent(new)
         if frame is None:
             return None

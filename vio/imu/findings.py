@@ -52,6 +52,8 @@ _UNUSABLE = {
     "accelerometer sign",
     "accelerometer axes",
 }
+# Clocks further apart are none that a filter which begins with them together can be left to find.
+MAX_FOLLOWED_OFFSET_S = 0.1
 
 
 _CODES: dict[InertialFault, str] = {
@@ -114,6 +116,8 @@ class InertialFinding:
     certain: bool = True  # False: a hint; correct data can look like this
     # that takes the unit of these readings to rad/s or m/s^2; None: none does
     factor: float | None = None
+    # a frame stamped t was exposed at t + this of the IMU's clock; None: not what was found
+    offset_s: float | None = None
 
     @property
     def code(self) -> str:
@@ -123,7 +127,8 @@ class InertialFinding:
     @property
     def is_disabling(self) -> bool:
         """Whether the readings are of no use to a filter, unless they are multiplied by a factor."""
-        return self.certain and self.fault in _UNUSABLE
+        too_far = self.offset_s is not None and abs(self.offset_s) > MAX_FOLLOWED_OFFSET_S
+        return self.certain and (self.fault in _UNUSABLE or too_far)
 
     @property
     def message(self) -> str:

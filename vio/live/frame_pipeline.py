@@ -197,8 +197,10 @@ class FramePipeline:
     def _recovered(self, index: int, estimate: Estimate) -> Estimate:
         """Begin a back end anew whose state has become impossible; return the frame's estimate."""
         good = self._recovery.take(estimate)
-        anew = None if good is None else self.backend.begin_anew(good)
-        if good is None or anew is None:
+        if good is None:
+            return estimate
+        anew = self.backend.begin_anew(self.monitor.with_clock_offset(good))
+        if anew is None:
             return estimate
         self.monitor.begun_anew(index, good.time_ns, anew)
         return self.monitor.judged(index, anew)

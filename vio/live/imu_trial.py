@@ -58,15 +58,15 @@ class ImuTrial:
             self.close()
 
     def again(self, verdict: ImuVerdict) -> tuple[Backend, dict[int, Estimate]] | None:
-        """Give everything to a new back end, with the IMU that a verdict leaves; but while it is in
-        doubt, nothing can be taken again then.
+        """Give everything to a new back end, with the IMU that a verdict leaves; but for a doubt and
+        its end, nothing can be taken again then.
 
         Return that back end and its estimates by frame number; None: it is lost, too.
         """
         backend = self._fresh
         taken = self._taken
         assert backend is not None
-        if verdict.in_doubt:
+        if verdict.in_doubt or verdict == AS_GIVEN:
             backend = copy.deepcopy(backend)
         else:
             self.close()

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
-from vio.imu.findings import InertialFinding
+from vio.imu.findings import MAX_FOLLOWED_OFFSET_S, InertialFinding
 from vio.monitor.motion import Record
 from vio.numerics.robust import robust_sigma
 from vio.records import BoolArray
@@ -34,7 +34,7 @@ class _RateRules(NamedTuple):
 _RATES = _RateRules()
 # share of the rotation that the best linear map leaves unexplained: below, explanations are judged
 AGREES = 0.2
-_NEAR_OFFSETS_S = np.arange(-0.1, 0.1001, 0.01)
+_NEAR_OFFSETS_S = np.linspace(-MAX_FOLLOWED_OFFSET_S, MAX_FOLLOWED_OFFSET_S, 21)
 FAR_OFFSETS_S = np.arange(-5.0, 5.001, 0.025)
 
 
@@ -128,7 +128,8 @@ def fit_gyro(record: Record, least: int, noise_radps: float | None = None) -> Gy
     best = _at_offset(record, _NEAR_OFFSETS_S, least, noise)
     if best is None or best.axes == 0:
         return None
-    if best.unexplained > AGREES:
+    at_border = abs(best.offset_s) > _NEAR_OFFSETS_S[-2]
+    if at_border or best.unexplained > AGREES:
         best = _search_far(record, best, least, noise)
     for step in (0.01, 0.003):
         near = _at_offset(record, best.offset_s + step * np.arange(-2, 3), least, noise)
@@ -137,7 +138,7 @@ def fit_gyro(record: Record, least: int, noise_radps: float | None = None) -> Gy
 
 
 def _search_far(record: Record, near: GyroFit, least: int, noise: float) -> GyroFit:
-    """Return the fit at a clock offset of seconds where it explains far more than the near one."""
+    """Return the fit at a clock offset of seconds where it leaves far less than the near one."""
     far = _at_offset(record, FAR_OFFSETS_S, max(least, len(record.twists) // 2), noise)
     return far if far is not None and far.unexplained < 0.5 * near.unexplained else near
 
@@ -230,6 +231,7 @@ def judge_offset(gyro_fit: GyroFit, record: Record, least: int) -> InertialFindi
         f"shift it {left})",
         f"the IMU's clock is ahead of the camera's by {gyro_fit.offset_s:+.3f} s; subtract that "
         "from the IMU's stamps",
+        offset_s=gyro_fit.offset_s,
     )
 
 

@@ -51,10 +51,13 @@ class _PossibleRules(NamedTuple):
     max_speed_mps: float = 100.0
     max_gyro_bias_radps: float = 0.5
     max_accel_bias_mps2: float = 3.0
+    # of the clocks' offset beside that of the rates of gyro and images, beyond its sigmas
+    max_offset_error_s: float = 0.02
+    offset_sigmas: float = 3.0
 
 
 _POSSIBLE = _PossibleRules()
-_STATE = ("speed", "gyro bias", "accelerometer bias")  # what is implausible of a state
+_STATE = ("speed", "gyro bias", "accelerometer bias", "clock")  # what is implausible of a state
 _SCALES = ("baseline", "focal length")
 
 
@@ -267,6 +270,32 @@ class RunHealth:
                 line = f"frame {index}: the {name} is estimated as {size:.2g} {unit}, which no working sensor has"
                 lines += self._once(index, name, size, limit, line)
         return lines
+
+    def clock(
+        self, index: int, estimate: Estimate, offset_s: float | None, since: int
+    ) -> list[Finding]:
+        """Report once that the clocks' offset is not what the rates of gyro and images show.
+
+        Args:
+            index: frame number.
+            estimate: of the frame.
+            offset_s: by the rates, see `InertialCheck.clock_offset_s`.
+            since: the first frame that they are of.
+        """
+        known = estimate.time_offset_s
+        if offset_s is None or known is None or "clock" in self._reported:
+            return []
+        sigma = estimate.time_offset_sigma_s or 0.0
+        off = abs(known - offset_s)
+        if off <= _POSSIBLE.max_offset_error_s + _POSSIBLE.offset_sigmas * sigma:
+            return []
+        self._reported.add("clock")
+        message = (
+            f"frame {index}: the estimate has frames exposed {1e3 * known:+.1f} ms after their stamps "
+            f"on the IMU's clock, the rates of gyro and images show {1e3 * offset_s:+.0f} ms: a clock "
+            "has jumped"
+        )
+        return [Finding("estimate-implausible", message, index, since, lasts=True)]
 
     def _once(self, index: int, what: str, value: float, limit: float, line: str) -> list[Finding]:
         if value <= limit or what in self._reported:

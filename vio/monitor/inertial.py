@@ -87,6 +87,8 @@ class InertialCheck:
         # the accelerometer's with the images' path, or there will be no rotation for it
         self.axes_compared = False
         self.clipped = False  # samples at the end of a range were left out
+        # by two evaluations in a row: a frame stamped t was exposed at t + this of the IMU's clock
+        self.clock_offset_s: float | None = None
         # by the newest judgement of units, axes, signs and clocks, reported yet or not
         self.imu_at_fault = False
 
@@ -165,8 +167,11 @@ class InertialCheck:
             return found
         self._since_evaluation = 0
         judged = self._judge(last=False)
-        found += [f for f in judged if f.fault in self._suspected]
+        confirmed = [f for f in judged if f.fault in self._suspected]
+        offsets = [f.offset_s for f in confirmed if f.offset_s is not None]
+        self.clock_offset_s = offsets[0] if offsets else None
         self._suspected = {f.fault for f in judged}
+        found += confirmed
         return found
 
     def _doubt_if(self, judged: Sequence[InertialFinding]) -> None:
@@ -306,6 +311,10 @@ class InertialCheck:
         gyro_fit = fit_gyro(record, _EVALUATIONS.min_intervals_at_end)
         turns = None if gyro_fit is None else compare_rotations(record, gyro_fit, self._T[:3, :3])
         if gyro_fit is None or turns is None:
+            return
+        offset = judge_offset(gyro_fit, record, _EVALUATIONS.min_intervals_at_end)
+        if offset is not None and offset.is_disabling:
+            self._doubt_if([offset])
             return
         if np.isfinite(turns.sigma) and turns.agree:
             self.rotation_comparison = turns

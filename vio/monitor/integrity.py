@@ -102,9 +102,11 @@ class IntegrityMonitor:
         self._new.append(finding)
 
     def end_since(self, good_ns: int, *codes: str) -> None:
-        """Let go of findings on a state that has been replaced: those that hold from a frame on
-        after the last good estimate; what holds for earlier ones is not the state's.
+        """Let go of findings on a state that has been replaced: that it was impossible, and those
+        that hold from a frame on after the last good estimate; what holds for earlier ones is not
+        the state's.
         """
+        self._holding.pop("estimate-implausible", None)
         for code in codes:
             entry = self._holding.get(code)
             if entry is not None and self._onset_ns(entry.finding, good_ns + 1) > good_ns:

@@ -83,6 +83,7 @@ class RunMonitor:
         self._waits_for = ""
         self._imu_at_fault = False
         self._scale_lines: list[Finding] = []  # not reported yet
+        self._compared_since = 0  # first frame that IMU and images are compared for
         self.imu_verdict = ImuVerdict()  # by the findings so far
         self.findings: list[Finding] = []
         # whether the run begins again once more of its right images can be put right
@@ -196,6 +197,15 @@ class RunMonitor:
         finding = Finding(_DOUBT, message, self._index, lasts=bool(why), ended=not why)
         self._add([finding])
 
+    def with_clock_offset(self, good: Estimate) -> Estimate:
+        """Return an estimate to go on from with the clocks' offset that the rates of gyro and images
+        show, where they were compared.
+        """
+        offset_s = None if self._inertial is None else self._inertial.clock_offset_s
+        if offset_s is None or good.time_offset_s is None:
+            return good
+        return replace(good, time_offset_s=offset_s)
+
     @property
     def rotation_comparison(self) -> RotationComparison | None:
         """How the camera's rotation compares with the gyro's so far; None: not compared yet, or no
@@ -305,7 +315,7 @@ class RunMonitor:
         is the time of the last estimate that could be used.
         """
         self._scale_lines = []
-        self._integrity.end_since(good_ns, "estimate-implausible", "scale-off")
+        self._integrity.end_since(good_ns, "scale-off")
         self._add([self._health.begun_anew(index, good_ns, estimate)])
 
     def update(
@@ -321,10 +331,17 @@ class RunMonitor:
             self._integrity.take_innovation(report.innovation_ratio)
         if report.gyro_jump_radps is not None and self._inertial is not None:
             self._inertial.begin_after_jump()
+            self._compared_since = index
         self._integrity.take_scale_doubt(index, report.scale_doubt)
         if self._seen is not None:
             self._add(self._refusals.frame(self._seen, report, estimate))
         self._scale_lines += self._health.scale(index, estimate)
+        if self._inertial is not None:
+            offset_s = self._inertial.clock_offset_s
+            apart = self._health.clock(index, estimate, offset_s, self._compared_since)
+            self._add(apart)
+            if apart:  # images alone go on where everything can be taken again
+                self.imu_verdict = replace(self.imu_verdict, usable=False)
         self._report_scale(last=False)
 
     def _report_scale(self, *, last: bool) -> None:
