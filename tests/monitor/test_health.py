@@ -181,3 +181,41 @@ def test_an_offset_of_clocks_that_the_rates_contradict_is_implausible(
 
 def test_an_offset_that_is_not_estimated_is_not_judged() -> None:
     assert RunHealth().clock(30, _estimate(30), 0.3, 12) == []
+
+
+def _ends(ratios: list[float | None], more: dict[int, dict[str, object]]) -> list[int]:
+    """The frames at which an implausible state is reported to have ended."""
+    health = RunHealth()
+    found = []
+    for k, ratio in enumerate(ratios):
+        report = replace(GOOD, innovation_ratio=ratio)
+        found += health.frame(k, report, _estimate(k, **more.get(k, {})))  # type: ignore[arg-type]
+    assert [f.frame for f in found if not f.ended] == [2]
+    return [f.frame for f in found if f.ended]
+
+
+WRONG: dict[str, object] = {"gyro_bias": np.array([0.0, 0.9, 0.0])}
+
+
+@pytest.mark.parametrize(
+    ("off", "again"), [(None, 102), (40, 140), (41, 141)], ids=["at once", "40", "41"]
+)
+def test_a_state_that_has_been_possible_for_long_is_so_again(off: int | None, again: int) -> None:
+    """Five seconds after the last frame with an impossible one, or whose images contradict it."""
+    usual: list[float | None] = [1.1] * 160
+    assert _ends(usual, {2: WRONG} if off is None else {2: WRONG, off: WRONG}) == [again]
+    if off is not None:
+        usual[off] = 2.2
+        assert _ends(usual, {2: WRONG}) == [again]
+        usual[off] = None
+        assert _ends(usual, {2: WRONG}) == [again]
+        usual[off] = 1.8
+        assert _ends(usual, {2: WRONG}) == [102]
+
+
+def test_a_clock_that_has_jumped_does_not_come_back_by_itself() -> None:
+    health = RunHealth()
+    report = replace(GOOD, innovation_ratio=1.0)
+    estimate = replace(_estimate(0), time_offset_s=0.0, time_offset_sigma_s=0.001)
+    assert health.clock(0, estimate, 0.1, 0)
+    assert not any(health.frame(k, report, _estimate(k)) for k in range(200))

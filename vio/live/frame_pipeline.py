@@ -163,16 +163,20 @@ class FramePipeline:
         return corrected(sample, self._imu)
 
     def begin_again(self, index: int) -> None:
-        """Where the monitor has become certain that the IMU is wrong, estimate all frames again;
-        else nothing.
+        """Where the monitor has become certain that the IMU is wrong, or doubts it, estimate all
+        frames again, or, where they are not kept any more, go on with what is left of the IMU.
         """
         trial = self._trial
         verdict = self.monitor.imu_verdict
-        if trial is None or not trial.open:
+        if trial is None:
             return
         if verdict == self._imu:
             if self.monitor.imu_is_judged:
                 trial.close()
+            return
+        if not trial.open:
+            self._imu = verdict
+            self.monitor.goes_on_from(index, verdict)
             return
         again = trial.again(verdict)
         if again is None:

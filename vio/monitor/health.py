@@ -54,6 +54,10 @@ class _PossibleRules(NamedTuple):
     # of the clocks' offset beside that of the rates of gyro and images, beyond its sigmas
     max_offset_error_s: float = 0.02
     offset_sigmas: float = 3.0
+    # after which an estimate is possible again: none that is not, and features within so many
+    # standard deviations of where they were predicted
+    settled_s: float = 5.0
+    settled_sigmas: float = 2.0
 
 
 _POSSIBLE = _PossibleRules()
@@ -82,6 +86,9 @@ class RunHealth:
         self._last_index = 0
         self._reported: set[str] = set()
         self._restarted_ns: int | None = None  # time of the last restart
+        self._impossible = False  # the present state
+        # time of the last frame with such a state, or that the images contradict
+        self._off_ns: int | None = None
 
     def restarted(self, index: int, why: str, estimate: Estimate) -> tuple[Finding, ...]:
         """Return the finding on a restart from an estimate, with the reason; none within a second
@@ -125,6 +132,7 @@ class RunHealth:
         found += self._stereo(index, estimate)
         found += self._jump(index, report)
         found += self._implausible(index, estimate)
+        found += self._settled(index, report, estimate)
         return tuple(found)
 
     def _jump(self, index: int, report: UpdateReport) -> list[Finding]:
@@ -254,6 +262,7 @@ class RunHealth:
     def _implausible(self, index: int, estimate: Estimate) -> list[Finding]:
         """Report once when the state is implausible for a vehicle."""
         lines: list[Finding] = []
+        self._impossible = False
         position = estimate.T_world_imu[:3, 3].copy()
         if self._last is not None and estimate.time_ns > self._last[0]:
             elapsed_s = (estimate.time_ns - self._last[0]) * 1e-9
@@ -297,7 +306,28 @@ class RunHealth:
         )
         return [Finding("estimate-implausible", message, index, since, lasts=True)]
 
+    def _settled(self, index: int, report: UpdateReport, estimate: Estimate) -> list[Finding]:
+        """Report that the state has been possible for long, as of a filter that has found its start
+        and that nothing replaces.
+        """
+        time_ns = estimate.time_ns
+        ratio = report.innovation_ratio
+        off = self._impossible or ratio is None or ratio > _POSSIBLE.settled_sigmas
+        if self._off_ns is None or off:
+            self._off_ns = time_ns
+        waits = time_ns - self._off_ns < _POSSIBLE.settled_s * NS_PER_S
+        # a clock that has jumped is not seen in the state
+        if waits or "clock" in self._reported or not self._reported.intersection(_STATE):
+            return []
+        self._reported -= {*_STATE}
+        message = (
+            f"frame {index}: the estimate is one that a working rig can have again, and the images "
+            "agree with it"
+        )
+        return [Finding("estimate-implausible", message, index, ended=True)]
+
     def _once(self, index: int, what: str, value: float, limit: float, line: str) -> list[Finding]:
+        self._impossible |= value > limit
         if value <= limit or what in self._reported:
             return []
         self._reported.add(what)

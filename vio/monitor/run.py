@@ -18,6 +18,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import AS_READ
 from vio.imu.findings import ImuVerdict
 from vio.monitor.contradiction import ImuContradiction
+from vio.monitor.force_fit import FIRST_EVALUATION
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RefusalReport, RunHealth, is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _DOUBT = "imu-in-doubt"
+# frames in which an IMU that is in doubt may have been wrong: that it was judged by
+_BEFORE_A_DOUBT = 2 * FIRST_EVALUATION
 # groups of faults without whose cure one camera finds no scale
 _PREVENTS_START = ("size", "overlap")
 
@@ -254,6 +257,26 @@ class RunMonitor:
 
     def begun_again(self, index: int, verdict: ImuVerdict, frames: int) -> None:
         """Report that the frames so far were estimated again with what is left of the IMU."""
+        self._goes_on(index, verdict, f"; the {frames} frames so far were estimated again")
+        if self._contradiction is not None:
+            self._add(self._contradiction.end(index))
+        self._health.begun_again()
+        self._integrity.begin_again()
+
+    def goes_on_from(self, index: int, verdict: ImuVerdict) -> None:
+        """Report that the run goes on from a frame with what is left of the IMU; what it has done to
+        the estimate since it has been compared stays, and is in the covariance.
+        """
+        was_used = self._refusals.imu
+        self._goes_on(index, verdict)
+        if verdict.used or not was_used:
+            return
+        since = max(self._compared_since, index - _BEFORE_A_DOUBT)
+        message = f"frame {index}: since frame {since} the estimate may have followed a wrong IMU"
+        self._add([Finding("estimate-implausible", message, index, since)])
+
+    def _goes_on(self, index: int, verdict: ImuVerdict, more: str = "") -> None:
+        """Report what is left of the IMU."""
         self._refusals.imu = verdict.used
         what = "the IMU is not used, and images alone go on"
         if verdict.in_doubt:
@@ -266,12 +289,7 @@ class RunMonitor:
                 if factor != 1
             ]
             what = " and ".join(factors) or "the IMU is used"
-        line = f"frame {index}: {what}; the {frames} frames so far were estimated again"
-        self._report("imu-not-used", [line])
-        if self._contradiction is not None:
-            self._add(self._contradiction.end(index))
-        self._health.begun_again()
-        self._integrity.begin_again()
+        self._report("imu-not-used", [f"frame {index}: {what}{more}"])
 
     def waiting(self, frame: StereoFrame, why: str) -> None:
         """Add a frame without a pose, as the back end's start is not observable yet; `why` is
