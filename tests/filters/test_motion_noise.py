@@ -170,7 +170,7 @@ def test_factors_wait_for_the_sum_and_pass_over_what_tells_little() -> None:
     np.testing.assert_allclose(noise.factors, 5.0 * np.exp(0.5 * change))
     learned = noise.factors.copy()
     for _ in range(10):
-        noise.update(_step(np.full(6, 1.0), remaining=3.9e-4))
+        noise.update(_step(np.full(6, 1.0), remaining=3.95e-4))
     np.testing.assert_array_equal(noise.factors, learned)
 
 
@@ -191,3 +191,65 @@ def test_a_single_wild_sum_moves_a_settled_factor_little() -> None:
     for _ in range(10):
         noise.update(StepErrors(np.full(6, 1e3), P, P, P * 1e-6))
     assert np.all(noise.factors / before < 1.25)
+
+
+def _seen(rng: np.random.Generator, P: float, sensor: float, images: float) -> StepErrors:
+    """A step of a sensor of variance `sensor` that P is thought to be, on all axes; `images`:
+    variance of the images.
+    """
+    gain = P / (P + images)
+    correction = gain * rng.normal(0.0, np.sqrt(sensor + images), 6)
+    return StepErrors(correction, P * np.eye(6), P * np.eye(6), (1 - gain) * P * np.eye(6))
+
+
+def _learned(truth: float, steps: int, share: float = 0.05) -> FloatArray:
+    """The factors after so many steps of a sensor that is worse than thought by a factor, and of
+    images that would remove a share of the variance that is thought of.
+    """
+    noise = MotionNoise(1.0, 1.0, 50.0)
+    rng = np.random.default_rng(3)
+    images = (1 - share) / share
+    for _ in range(steps):
+        P = float(noise.factors.max()) ** 2
+        noise.update(_seen(rng, P, truth**2, images))
+    return noise.factors
+
+
+def test_a_sensor_that_is_thought_far_better_than_the_images_is_found_out() -> None:
+    """The images would remove a twentieth of its variance, which tells little; that corrections are
+    exceptions sum after sum does.
+    """
+    assert np.all(_learned(10.0, 400) > 6.0)
+    assert np.all(_learned(10.0, 400) < 15.0)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2])
+def test_a_sensor_that_is_far_better_than_the_images_stays_what_it_is(share: float) -> None:
+    assert np.all(_learned(1.0, 4000, share) < 1.2)
+
+
+def _after(*sizes: float, remaining: float = 0.95) -> float:
+    """The factor after sums of steps of these sizes, each of ten, whose images remove little."""
+    noise = MotionNoise(1.0, 1.0, 50.0)
+    for size in sizes:
+        for k in range(10):
+            left = remaining * np.eye(6)
+            noise.update(StepErrors(np.full(6, size * (k == 9)), np.eye(6), np.eye(6), left))
+    return float(noise.factors[0])
+
+
+def test_one_exception_alone_is_no_noise() -> None:
+    """As of a bias that jumps, and is estimated anew."""
+    assert _after(20.0, 0.0, 20.0) == 1.0
+    assert _after(20.0, 20.0) > 1.5
+
+
+# chi-square of three for ten steps: 3 size^2 over 10 times the share removed, 11.3 at 0.99
+LIMITS = [(1.3, 0.95, False), (1.45, 0.95, True), (20.0, 0.985, False), (20.0, 0.975, True)]
+
+
+@pytest.mark.parametrize(("size", "remaining", "found"), LIMITS)
+def test_exceptions_begin_at_one_of_a_hundred_where_images_remove_two_hundredths(
+    size: float, remaining: float, found: bool
+) -> None:
+    assert (_after(size, size, remaining=remaining) > 1.0) == found

@@ -24,6 +24,11 @@ class _NoiseRules(NamedTuple):
     summed_steps: int = 10
     # share of its predicted variance that the images must have removed for a direction to count
     informed_share: float = 0.3
+    # … and for one to count in which nearly nothing was removed, but what was is an exception: of a
+    # sensor that is thought far better than the images, and is not
+    doubted_share: float = 0.02
+    # chi-square probability beyond which a sum is one; twice in a row is as rare as a single step
+    exception_probability: float = 0.99
     # initial standard deviation of the logarithm of the squared factor
     log_variance_sigma: float = 1.5
     log_variance_walk: float = 0.15  # its random walk per sum of steps
@@ -34,6 +39,7 @@ class _NoiseRules(NamedTuple):
 
 _NOISE = _NoiseRules()
 _SURPRISING = chi_square_quantile(_NOISE.surprise_probability, np.arange(1, 4)).tolist()
+_EXCEPTIONAL = chi_square_quantile(_NOISE.exception_probability, np.arange(1, 4)).tolist()
 _PARTS = slice(0, 3), slice(3, 6)  # translation, rotation
 # d E[2 F_k(e^t x) - 1] / dt at t = 0 for x ~ chi-square(k), k = 0..3
 _SENSITIVITY = (0.0, 1 / np.pi, 0.5, 2 / np.pi)
@@ -89,15 +95,17 @@ class WhitenedCorrection:
     share: float
 
 
-def whitened_correction(step: StepErrors, part: slice) -> WhitenedCorrection:
+def whitened_correction(
+    step: StepErrors, part: slice, informed_share: float = _NOISE.informed_share
+) -> WhitenedCorrection:
     """Test one part (translation or rotation) of a correction against its covariance,
     `expected - remaining`.
 
     Directions are the eigenvectors of the removed share of the predicted covariance; those in which
-    the images removed little say nothing about the motion model and are left out.
+    the images removed little say little about the motion model and are left out.
     """
     errors = step.correction, step.expected, step.process, step.remaining
-    found = WhitenedCorrection(*loops.whiten_correction(*errors, part.start, _NOISE.informed_share))
+    found = WhitenedCorrection(*loops.whiten_correction(*errors, part.start, informed_share))
     if math.isnan(found.squared):
         raise np.linalg.LinAlgError("the predicted covariance is not positive")
     return found
@@ -126,6 +134,8 @@ class MotionNoise:
         self._variance: FloatArray = np.full(2, _NOISE.log_variance_sigma**2)
         self._sum: StepErrors | None = None
         self._steps = 0
+        # whether the last sum of each part was an exception
+        self._exception = [False, False]
 
     def update(self, step: StepErrors) -> None:
         """Learn from one step."""
@@ -134,9 +144,19 @@ class MotionNoise:
         if self._steps < _NOISE.summed_steps:
             return
         for k, part in enumerate(_PARTS):
-            self._update_factor(k, whitened_correction(self._sum, part))
+            self._update_factor(k, self._test(self._sum, k, part))
         self._sum = None
         self._steps = 0
+
+    def _test(self, step: StepErrors, k: int, part: slice) -> WhitenedCorrection:
+        """Test one part of a sum of steps in the directions that the images inform, or in all, if
+        it is an exception there for the second time in a row: a bias that jumps is one once.
+        """
+        informed = whitened_correction(step, part)
+        every = whitened_correction(step, part, _NOISE.doubted_share)
+        was_exception = self._exception[k]
+        self._exception[k] = every.dof > 0 and every.squared > _EXCEPTIONAL[every.dof - 1]
+        return every if was_exception and self._exception[k] else informed
 
     def _update_factor(self, k: int, test: WhitenedCorrection) -> None:
         self._variance[k] += _NOISE.log_variance_walk**2
