@@ -164,7 +164,8 @@ def _gyro_says(
         S_cc=I3,
         S_gg=I3,
     )
-    return [f.fault for f in gyro.judge_gyro(_evidence(gyro_fit=fit, clipped=clipped), 1.0)]
+    evidence = _evidence(gyro_fit=fit, clipped=clipped)
+    return [f.fault for f in gyro.judge_gyro(evidence, 1.0, turns=False)]
 
 
 def _agrees(unexplained: float) -> bool:

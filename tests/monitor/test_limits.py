@@ -291,7 +291,7 @@ def _gyro_fit(
     S = rate**2 * np.eye(3)
     none = np.zeros((0, 3))
     return GyroFit(
-        0.0, S, S, S, np.eye(3), np.zeros(3), unexplained, noise, count, none, none,
+        0.0, S, S, S, np.eye(3), np.zeros(3), unexplained, noise, count, none, none, none,
         np.zeros(0, np.bool_), np.zeros(0),
     )  # fmt: skip
 

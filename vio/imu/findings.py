@@ -87,6 +87,8 @@ class ImuVerdict:
     usable: bool = True
     gyro_factor: float = 1.0  # on its readings
     accel_factor: float = 1.0
+    # by which both readings are turned, rad, of the IMU's frame
+    turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # they look useless, which is not certain yet, or why is not known
     in_doubt: bool = False
 
@@ -99,6 +101,8 @@ class ImuVerdict:
         """Return the verdict with one more finding."""
         if not finding.is_disabling:
             return self
+        if finding.turn_rad is not None:
+            return replace(self, turn_rad=finding.turn_rad)
         if finding.factor is None:
             return replace(self, usable=False)
         if finding.fault == "gyro units":
@@ -118,6 +122,8 @@ class InertialFinding:
     factor: float | None = None
     # a frame stamped t was exposed at t + this of the IMU's clock; None: not what was found
     offset_s: float | None = None
+    # that turns the readings as the given extrinsics want them, of the IMU's frame; None: none does
+    turn_rad: tuple[float, float, float] | None = None
 
     @property
     def code(self) -> str:
@@ -126,7 +132,9 @@ class InertialFinding:
 
     @property
     def is_disabling(self) -> bool:
-        """Whether the readings are of no use to a filter, unless they are multiplied by a factor."""
+        """Whether the readings are of no use to a filter, unless they are multiplied by a factor or
+        turned.
+        """
         too_far = self.offset_s is not None and abs(self.offset_s) > MAX_FOLLOWED_OFFSET_S
         return self.certain and (self.fault in _UNUSABLE or too_far)
 

@@ -257,6 +257,7 @@ def build_processor(
         use_prior=config.frontend.prior,
         trial=_trial(source, parts, backend, map),
         reading=source.reading_check(),
+        extrinsics_known=config.msckf.calibrate_camera_imu not in ("extrinsics", "both"),
     )
     session = None if map is None else _open_map(map, source, config, backend)
     return EventProcessor(pipeline, wait_for_imu=source.motion == "imu", map=session)

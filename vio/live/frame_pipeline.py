@@ -56,11 +56,14 @@ class FramePipeline:
         use_prior: bool,
         trial: ImuTrial | None = None,
         reading: ReadingCheck | None = None,
+        extrinsics_known: bool = True,
     ) -> None:
         self.frontend = parts.frontend
         self.selector = parts.selector
         self.backend = parts.backend
-        self.monitor = RunMonitor(camera, T_cam0_body, imu=motion == "imu")
+        self.monitor = RunMonitor(
+            camera, T_cam0_body, imu=motion == "imu", extrinsics_known=extrinsics_known
+        )
         self._motion = motion
         self._use_prior = use_prior
         self._propagate_ms = 0.0  # since the last frame
@@ -168,6 +171,7 @@ class FramePipeline:
         """
         trial = self._trial
         verdict = self.monitor.imu_verdict
+        self.monitor.can_begin_again = trial is not None and trial.open
         if trial is None:
             return
         if verdict == self._imu:

@@ -14,7 +14,10 @@ import copy
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from vio.errors import DivergedError, EstimationError
+from vio.geometry.lie import so3_exp
 from vio.imu.findings import ImuVerdict
 from vio.numerics.kinds import Capacity
 from vio.protocols import Backend
@@ -103,11 +106,15 @@ def corrected_all(samples: Sequence[MotionSample], verdict: ImuVerdict) -> Seque
 
 
 def corrected(sample: MotionSample, verdict: ImuVerdict) -> MotionSample | None:
-    """Return a sample in the right units; None: it is not to be used."""
+    """Return a sample in the right units and axes; None: it is not to be used."""
     if verdict is AS_GIVEN or verdict == AS_GIVEN or not isinstance(sample, ImuSample):
         return sample
     if not verdict.used:
         return None
-    return replace(
-        sample, gyro=verdict.gyro_factor * sample.gyro, accel=verdict.accel_factor * sample.accel
-    )
+    gyro = verdict.gyro_factor * sample.gyro
+    accel = verdict.accel_factor * sample.accel
+    if any(verdict.turn_rad):
+        R = so3_exp(np.array(verdict.turn_rad))
+        gyro = R @ gyro
+        accel = R @ accel
+    return replace(sample, gyro=gyro, accel=accel)

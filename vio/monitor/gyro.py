@@ -11,11 +11,12 @@ import numpy.typing as npt
 
 from vio.dataclass import dataclass
 from vio.evaluation.errors_along_path import rotation_angle_deg
-from vio.geometry.lie import FloatArray, nearest_rotation
+from vio.geometry.lie import FloatArray, nearest_rotation, so3_exp
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import AXES_WORSE, axes_text, signed_permutations
 from vio.monitor.force_fit import Evidence
 from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit
+from vio.monitor.turned_imu import judge_turn, turned_finding
 
 
 class _ExcessRules(NamedTuple):
@@ -41,13 +42,19 @@ class _Explanation:
     explanation: str
 
 
-def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
+def judge_gyro(evidence: Evidence, unit: float, *, turns: bool = True) -> list[InertialFinding]:
     """Compare the gyro's rates, mapped by the given rotation, with the camera's; forces times
     `unit` are m/s^2.
+
+    Without `turns`, a rotation that is off by degrees is left to the filter to estimate.
     """
     gyro_fit = evidence.gyro_fit
     R = evidence.R_cam0_imu
     brief = evidence.brief
+    turn = judge_turn(evidence) if turns else None
+    if turn is not None:
+        C = so3_exp(turn.rotation) @ R
+        return [turned_finding(turn, R), *_judge_scale(evidence, C)]
     if gyro_fit.unexplained > _EXCESS.disagreeing_share:
         return [] if brief else [_disagreement(gyro_fit)]
     limit = max(

@@ -68,6 +68,7 @@ class GyroFit:
     unexplained: float  # share of the camera's rotation that the map leaves unexplained, 0 to 1
     noise_radps: float  # of the camera's rates, each axis
     count: int  # intervals with samples
+    camera: FloatArray  # (K, 3) its rates in each interval, rad/s
     gyro: FloatArray  # (K, 3) mean rates of each interval, rad/s
     force: FloatArray  # (K, 3) mean specific forces, unit of the readings
     covered: BoolArray  # (K,) samples cover the interval
@@ -173,6 +174,7 @@ def _at_offset(
         unexplained=float(share),
         noise_radps=noise,
         count=int(covered[k].sum()),
+        camera=omega,
         gyro=gyro[k],
         force=means[k, :, 3:],
         covered=covered[k],

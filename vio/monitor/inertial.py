@@ -58,10 +58,15 @@ class InertialCheck:
     are checked until the end of the run.
     """
 
-    def __init__(self, camera: StereoCamera, T_cam0_imu: FloatArray) -> None:
+    def __init__(
+        self, camera: StereoCamera, T_cam0_imu: FloatArray, *, extrinsics_known: bool = True
+    ) -> None:
         """Create the check, for observations of a rectified pair and `T_cam0_imu` (4, 4) as the
         run uses it.
+
+        `extrinsics_known`: the filter does not estimate them.
         """
+        self._turns = extrinsics_known
         self._stereo = camera
         self._T = np.array(T_cam0_imu, dtype=np.float64)
         self._reported: set[str] = set()
@@ -248,12 +253,13 @@ class InertialCheck:
 
         gyro_fit = evidence.gyro_fit
         size = resolve_size(size, evidence)
-        rotation = judge_gyro(evidence, size.unit or 1.0)
+        rotation = judge_gyro(evidence, size.unit or 1.0, turns=self._turns)
         found = self._judge_size_and_rates(size, record, gyro_fit, rotation)
         forces, measured = self._judge_force(evidence, size, rotation)
         found += forces
         # which of gyro and extrinsics is at fault may be open yet
-        self._doubt_if([*found, *judge_gyro(replace(evidence, force_final=True), size.unit or 1.0)])
+        final = replace(evidence, force_final=True)
+        self._doubt_if([*found, *judge_gyro(final, size.unit or 1.0, turns=self._turns)])
         self.imu_at_fault |= _shows_fault(found, evidence)
         force_is_settled = measured or size.unit is None or bool(rotation)
         enough = force_is_settled and _has_enough_rotation(gyro_fit)
@@ -325,7 +331,7 @@ class InertialCheck:
         clipped = self.clipped or "saturation" in self._reported
         # what axes and unit are at fault is not asked yet
         evidence = Evidence(self._T[:3, :3], gyro_fit, None, None, True, clipped, False)
-        self._doubt_if(judge_gyro(evidence, 1.0))
+        self._doubt_if(judge_gyro(evidence, 1.0, turns=self._turns))
 
     def _compare_rotations(self, record: Record, gyro_fit: GyroFit) -> list[InertialFinding]:
         """Compare the camera's rotation with the gyro's until they differ beyond doubt."""

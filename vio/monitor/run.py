@@ -53,9 +53,16 @@ class RunMonitor:
     `repeats` and `without_repeated_depth` decide which frames and depth images are dropped.
     """
 
-    def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, *, imu: bool) -> None:
-        """Create the monitors of a rectified pair; extrinsics (4, 4); `imu`: raw samples
-        propagate the pose.
+    def __init__(
+        self,
+        camera: StereoCamera,
+        T_cam0_body: FloatArray,
+        *,
+        imu: bool,
+        extrinsics_known: bool = True,
+    ) -> None:
+        """Create the monitors of a rectified pair; extrinsics (4, 4), which the filter estimates if
+        they are not known; `imu`: raw samples propagate the pose.
         """
         self._health = RunHealth()
         self._refusals = RefusalReport(imu=imu)
@@ -73,7 +80,7 @@ class RunMonitor:
         if imu:
             from vio.monitor.inertial import InertialCheck  # it loads scipy.optimize
 
-            self._inertial = InertialCheck(camera, T_cam0_body)
+            self._inertial = InertialCheck(camera, T_cam0_body, extrinsics_known=extrinsics_known)
         self._new: list[ImuSample] = []  # since the last frame
         self._frames = self._features = 0
         self._index = -1  # of the present frame, and of the one before it
@@ -91,6 +98,8 @@ class RunMonitor:
         self.findings: list[Finding] = []
         # whether the run begins again once more of its right images can be put right
         self.ends_at_repair = False
+        # whether the run still can estimate its frames again with what is left of the IMU
+        self.can_begin_again = False
         self.repair = AS_READ  # of the recording's right images, by what was found so far
         self._integrity = IntegrityMonitor()
 
@@ -288,6 +297,9 @@ class RunMonitor:
                 for name, factor in parts
                 if factor != 1
             ]
+            angle = np.degrees(np.linalg.norm(verdict.turn_rad))
+            if angle > 0.0:
+                factors.append(f"the IMU's readings are turned by {angle:.1f} degrees")
             what = " and ".join(factors) or "the IMU is used"
         self._report("imu-not-used", [f"frame {index}: {what}{more}"])
 
@@ -358,7 +370,7 @@ class RunMonitor:
             offset_s = self._inertial.clock_offset_s
             apart = self._health.clock(index, estimate, offset_s, self._compared_since)
             self._add(apart)
-            if apart:  # images alone go on where everything can be taken again
+            if apart and self.can_begin_again:  # by images alone; else the filter is begun anew
                 self.imu_verdict = replace(self.imu_verdict, usable=False)
         self._report_scale(last=False)
 

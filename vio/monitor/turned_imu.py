@@ -1,0 +1,108 @@
+"""An IMU that is turned against its calibration by degrees: the rotation of `T_cam0_imu` that the
+rates of gyro and camera show.
+
+The fit of one rotation to vectors in two frames is Wahba's problem; near the given rotation it is
+linear. About an axis that nothing turns across, it shows nothing.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray, so3_exp
+from vio.imu.findings import InertialFinding
+from vio.monitor.force_fit import FIRST_EVALUATION, Evidence
+from vio.monitor.gyro_fit import AGREES, GyroFit
+from vio.numerics.kinds import Tolerance
+from vio.numerics.robust import jackknife
+
+_BLOCKS: Tolerance[int] = 10  # of the record, for the jackknife
+_STEPS: Tolerance[int] = 8  # of the linear fit, which begins at no turn
+
+
+class _TurnRules(NamedTuple):
+    """When the IMU is turned against its calibration."""
+
+    # Healthy recordings come to 1.1 (images rendered along flights of EuRoC, their real IMU, turns
+    # about two axes) and calibrations by hand to 3; 4 cost a filter eight times its accuracy.
+    min_deg: float = 3.5
+    # beyond it, axes that were exchanged or the inverse transform are likelier
+    max_deg: float = 40.0
+    sigmas: float = 6.0  # standard deviations of the turn, in its most uncertain direction
+
+
+_TURN = _TurnRules()
+
+
+class Turn(NamedTuple):
+    """How the gyro is turned against the camera, beyond the given rotation."""
+
+    rotation: FloatArray  # (3,) of the camera's frame, rad: true = exp(rotation) given
+    scale: float  # of the gyro
+    sigma: float  # standard deviation of its most uncertain component, rad
+
+
+def turn_of_gyro(gyro_fit: GyroFit, R_cam0_imu: FloatArray) -> Turn:
+    """Fit the rotation and the scale by which the gyro's rates, mapped by a rotation (3, 3), become
+    the camera's.
+    """
+    weight = gyro_fit.weight
+    camera = gyro_fit.camera
+    gyro = gyro_fit.gyro @ R_cam0_imu.T
+    blocks = np.arange(len(weight)) * _BLOCKS // len(weight)
+    rotation, scale = _fit(camera, gyro, weight)
+    without = [_fit(camera, gyro, weight * (blocks != k))[0] for k in range(_BLOCKS)]
+    return Turn(rotation, scale, float(jackknife(without).max()))
+
+
+def _fit(camera: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[FloatArray, float]:
+    """Return the rotation (3,) and the scale of rates (K, 3), means removed, by least squares."""
+    w = weight / weight.sum()
+    camera = camera - w @ camera
+    gyro = gyro - w @ gyro
+    rotation = np.zeros(3)
+    scale = 1.0
+    for _ in range(_STEPS):
+        turned = gyro @ so3_exp(rotation).T
+        moments = (w[:, None] * turned).T @ turned
+        total = float(np.trace(moments))
+        scale = float(np.sum(w[:, None] * turned * camera)) / total
+        information = total * np.eye(3) - moments
+        rotation = rotation + np.linalg.solve(information, w @ np.cross(turned, camera)) / scale
+    return rotation, scale
+
+
+def judge_turn(evidence: Evidence) -> Turn | None:
+    """Return the turn of an IMU whose calibration is clearly wrong by degrees; None: it is not,
+    or too little is known of it.
+    """
+    gyro_fit = evidence.gyro_fit
+    is_known = gyro_fit.unexplained < AGREES and gyro_fit.axes > 1
+    used = int(np.count_nonzero(gyro_fit.weight))
+    if not is_known or used < FIRST_EVALUATION or evidence.clipped:
+        return None
+    turn = turn_of_gyro(gyro_fit, evidence.R_cam0_imu)
+    angle = float(np.linalg.norm(turn.rotation))
+    is_turn = np.radians(_TURN.min_deg) < angle < np.radians(_TURN.max_deg)
+    return turn if is_turn and angle > _TURN.sigmas * turn.sigma else None
+
+
+def turned_finding(turn: Turn, R_cam0_imu: FloatArray) -> InertialFinding:
+    """The finding of a turn against the given rotation (3, 3)."""
+    degrees = np.degrees(np.linalg.norm(turn.rotation))
+    R = so3_exp(turn.rotation) @ R_cam0_imu
+    rows = ", ".join("[" + ", ".join(f"{x:.4f}" for x in row) + "]" for row in R)
+    seen = (
+        f"the gyro is turned by {degrees:.1f} deg against the camera, beyond the given T_cam0_imu "
+        f"(standard deviation {np.degrees(turn.sigma):.1g} deg)"
+    )
+    remedy = f"the rotation of T_cam0_imu should be [{rows}]; run `vio calibrate`"
+    turned = R_cam0_imu.T @ turn.rotation
+    return InertialFinding(
+        "extrinsics rotation",
+        seen,
+        remedy,
+        turn_rad=(float(turned[0]), float(turned[1]), float(turned[2])),
+    )
