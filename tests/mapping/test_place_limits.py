@@ -483,3 +483,10 @@ def test_words_are_those_of_maps_that_were_written_before() -> None:
     bits: Pixels = np.random.default_rng(7).integers(0, 256, (2, 32), dtype=np.uint8)
     words: IntArray = words_of(bits).astype(np.int64)
     assert words.tolist() == [[12168, 6194], [13566, 7080], [12526, 7013], [7843, 8261]]
+
+
+def test_an_image_without_key_points_has_descriptors_as_wide_as_others() -> None:
+    gray = np.full((360, 480), 128, np.uint8)
+    blobs = _gray(40.0 * _texture(360, 480))
+    wide = extract(blobs, blobs).descriptors.shape[1]
+    assert extract(gray, gray).descriptors.shape == (0, wide)
