@@ -67,7 +67,8 @@ class _ConsensusRules(NamedTuple):
     min_bearing_share: float = 0.5
     # share of inliers of a predicted rotation above which no other rotation is tried
     sure_bearing_share: float = 0.9
-    five_point_confidence: float = 0.999
+    # that no better motion is left, at which sampling ends; at two thirds as many are found
+    five_point_confidence: Tolerance[float] = 0.999
     epsilon: Tolerance[float] = 1e-9  # added to denominators
     # of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as
     # large

@@ -26,10 +26,11 @@ from vio.calibration.pair_rotation import (
     rotation_by_rows,
 )
 from vio.calibration.stereo_field import disparity_off
+from vio.cameras.rig import Rig
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray, se3_exp, transform_points
 from vio.geometry.stereo import project
-from vio.records import FIELD_TERMS, FeatureTracks, StereoFieldEstimate
+from vio.records import FIELD_TERMS, ROW_TERMS, FeatureTracks, StereoFieldEstimate
 
 Says = Callable[[float], bool]
 NONE: Any = None
@@ -339,6 +340,18 @@ def _rig_found(left_px: float) -> bool:
     return True
 
 
+def _left_px() -> float:
+    """What a rig leaves of columns and rows that no rig makes, over the image (root mean square)."""
+    rng = np.random.default_rng(2)
+    columns = 4e-3 * rng.normal(size=FIELD_TERMS)
+    rows = 4e-3 * rng.normal(size=ROW_TERMS)
+    field = StereoFieldEstimate(
+        columns, 1e-8 * np.eye(FIELD_TERMS), 0.3, rows, 1e-8 * np.eye(ROW_TERMS)
+    )
+    given = Rig.rectified(400.0, 400.0, 319.5, 239.5, 0.1, 640, 480)
+    return float(stereo_field._with_field(given, field).left_px)
+
+
 PAIRS: dict[str, tuple[Says, float, float]] = {
     "turned: rows": (lambda x: is_turned_by_rows(np.array([x, 0.0, 0.0])), 0.17, 0.23),
     "turned: yaw": (lambda x: is_turned_by_rows(np.array([0.0, x, 0.0])), 0.78, 1.02),
@@ -349,6 +362,7 @@ PAIRS: dict[str, tuple[Says, float, float]] = {
     "motion: distortion": (lambda x: _yaw_sigma() < 2.0 * x, 1.7e-3, 2.3e-3),
     "motion: largest distortion": (lambda x: not _is_believed(x), 5.3e-3, 6.9e-3),
     "named": (lambda x: _lines(x) > 0, 2.6, 3.4),
+    "points over the image": (lambda x: _left_px() < x, 0.61, 0.71),
     "no such rig": (lambda x: not _rig_found(x), 4.3, 5.7),
     "reading: straighter": (lambda x: _reads(x) is None, 0.17, 0.23),
     "reading: alike": (lambda x: _reads(0.1, 0.1 * x) == "first", 1.3, 1.7),

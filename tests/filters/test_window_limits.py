@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from vio.filters.settings import MsckfSettings
 from vio.filters.step_by_images import linked_points, step_by_images
 from vio.filters.track_records import Residuals, Views
 from vio.filters.window import Window
+from vio.filters.window_fit import WindowFit
 from vio.imu.settings import DEFAULT_IMU
 from vio.records import ImuSample
 
@@ -173,6 +175,14 @@ def _pose_trace(features: int) -> float:
     return float(np.trace(vislam.estimate().covariance))
 
 
+def _point_steps() -> int:
+    """How often the points of a window's tracks move after its poses did."""
+    own = MagicMock()
+    own.information.return_value = (np.eye(1), np.zeros(1), NONE)
+    WindowFit.fit(own, NONE, MagicMock(rows=np.arange(3)), NONE, None)
+    return int(own.linearise.call_args.args[2])
+
+
 LIMITS: dict[str, tuple[Says, float, float]] = {
     "landmark: all views": (lambda x: not _promoted(by_depth=x), 0.0087, 0.0113),
     "landmark: right views": (lambda x: not _promoted(by_stereo=x), 0.087, 0.113),
@@ -180,6 +190,7 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "weight": (lambda x: _weight(x) < 0.5, 5.2, 6.8),
     # the squared scale is that of the median over 2.37
     "weight: scale": (lambda x: _weight(6.0, np.sqrt(x)) > 0.501, 2.1, 2.7),
+    "steps of points": (lambda n: _point_steps() < n, 1, 2),
     "ahead": (_is_ahead, 0.43, 0.57),
     "predicted": (lambda s: not _is_predicted(s), 0.17, 0.23),
     "rows have moved": (_rows_have_moved, 0.135, 0.175),

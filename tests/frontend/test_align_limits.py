@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from vio.frontend.align import align, shift_warps
+from vio.frontend.align import align, cut_patches, rounded, shift_warps
+from vio.frontend.anchor_fit import AnchorFit
 from vio.frontend.tracks import AnchorBank
 from vio.geometry.lie import FloatArray
 from vio.records import Image
@@ -75,12 +78,39 @@ def _moved_px(shift: int, iterations: int = 1) -> float:
     return float(warp[0, 0, 2] - AT[0, 0])
 
 
+def _followed_px() -> float:
+    """How far an anchor is from where it belongs after the steps of a frame, in an image that is so
+    blurred that each step is short.
+    """
+    texture = _texture(30.0)
+    bank = AnchorBank(2, 9)
+    slots = bank.add(_image(texture), AT)
+    blurred = cv2.GaussianBlur(np.roll(texture, 1, axis=1), (0, 0), 4.0)
+    before: Any = SimpleNamespace(full=_image(texture))
+    after: Any = SimpleNamespace(full=_image(blurred))
+    own: Any = SimpleNamespace(_bank=bank)
+    warp, _ = AnchorFit._realign(own, before, after, AT, slots, AT.copy(), np.ones(1))
+    return float(AT[0, 0] + 1.0 - warp[0, 0, 2])
+
+
 LIMITS: dict[str, tuple[Says, float, float]] = {
     "row": (lambda x: _row_px(7.0) < x, 0.42, 0.58),
     "worst score": (lambda x: _worst_sigma() < x, 8.0, 12.0),
     "inside": (_is_inside, 8.0, 9.0),
+    "steps of a frame": (lambda x: _followed_px() < x, 2.23, 2.33),
     "step": (lambda x: _moved_px(4) < x, 1.05, 1.6),
 }
+
+
+def test_anchors_are_cut_at_fractions_of_a_pixel_that_float32_holds_exactly() -> None:
+    """A gray level between four pixels is then a multiple of the square of the fraction."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (120, 120)).astype(np.uint8)
+    centres = rng.uniform(40.0, 80.0, (50, 2))
+    cut = rounded(centres)
+    assert np.abs(cut - centres).max() <= 1.001 / 64.0
+    levels = 1024.0 * cut_patches(image, cut, 9).astype(np.float64)
+    assert np.array_equal(levels, np.rint(levels))
 
 
 @pytest.mark.parametrize(("says", "below", "above"), LIMITS.values(), ids=LIMITS)

@@ -22,6 +22,35 @@ Says = Callable[[float], bool]
 STILL = np.eye(4)
 
 
+def _row_after_a_frame() -> float:
+    """The row difference that is learned of 100 matches with one of a pixel, almost half of which are
+    further off.
+    """
+    model = EpipolarRowModel(640, 480)
+    left = np.random.default_rng(0).uniform([0.0, 0.0], [640.0, 480.0], (100, 2))
+    right = left + np.array([-10.0, 1.0])
+    right[:45, 1] += 0.8
+    model.update(left, right)
+    return model.offset_px
+
+
+def _has_point(disparity_px: float) -> bool:
+    """Whether a match gives a point whose disparity is so small after the right camera's turn."""
+    columns = stereo_fit._RightColumns(
+        np.zeros((1, 2)),
+        np.zeros(1, np.bool_),
+        np.zeros((1, 2, 2)),
+        np.zeros((1, 3)),
+        np.zeros(1, np.bool_),
+    )
+    matches = stereo_fit._Matches(
+        np.array([[100.0 - disparity_px, 50.0]]), np.zeros((1, 2, 2)), np.ones(1, np.bool_)
+    )
+    left = np.array([[100.0, 50.0]])
+    stereo_fit._match(camera_args(CAMERA), 40.0, left, np.array([0]), matches, columns)
+    return bool(columns.has_point[0])
+
+
 def _is_match(
     row_px: float = 0.0, skew: float = 0.0, disparity_px: float = 20.0, score: float = 1.0
 ) -> bool:
@@ -158,6 +187,8 @@ def _moved(px: float) -> bool:
 LIMITS: dict[str, tuple[Says, float, float]] = {
     "match: row": (lambda x: not _is_match(row_px=x), 0.87, 1.13),
     "match: skew": (lambda x: not _is_match(skew=x), 0.7, 0.9),
+    "rows: weights": (lambda x: _row_after_a_frame() < x, 1.055, 1.08),
+    "match: depth": (_has_point, 0.09, 0.11),
     "match: disparity": (lambda x: _is_match(disparity_px=x), 0.26, 0.34),
     "match: correlation": (lambda x: _is_match(score=x), 0.74, 0.86),
     "match: peak": (lambda x: not _moved(x), 2.2, 2.8),

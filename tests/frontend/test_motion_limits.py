@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from tests.frontend.test_new_limits import _tracks
 from vio.frontend import anchor_fit, flow, moving_object, outliers, right_alone, stereo_fit
 from vio.frontend.anchor_fit import AnchorFit
 from vio.frontend.columns import changed
-from vio.frontend.descriptors import DescriptorFrontend
+from vio.frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
 from vio.frontend.given_corners import given_corners
 from vio.frontend.moving_object import TwoMotions, voters
 from vio.frontend.one_camera import disparities
@@ -24,13 +25,13 @@ from vio.frontend.patches import ImageLevels
 from vio.frontend.reappearance import motion_across
 from vio.frontend.right_alone import RightAlone
 from vio.frontend.right_match import RightMatcher
-from vio.frontend.settings import DisparitySettings, GridSettings
+from vio.frontend.settings import DisparitySettings, FrontendSettings, GridSettings
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.stereo_match import EpipolarRowModel
 from vio.frontend.tracks import AnchorBank, Tracks, new_tracks
 from vio.geometry.lie import FloatArray, se3_exp, so3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.records import Image
+from vio.records import Image, IntArray, StereoFrame
 
 Says = Callable[[float], bool]
 WIDTH, HEIGHT = 480, 300
@@ -434,12 +435,62 @@ def _searched(px: float) -> bool:
     return bool(DescriptorFrontend._near_guess(nothing, old, np.zeros((1, 2)), point, 500)[0, 0])
 
 
+def _blobs() -> FloatArray:
+    noise = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.5)
+    return np.asarray(128.0 + 40.0 * smooth / smooth.std())
+
+
+def _follows(moved_px: float) -> bool:
+    """Whether a key point of a resting camera is tracked, around which the images move by so much."""
+    row = 100.0
+    u, v = (
+        a.ravel() for a in np.meshgrid(np.arange(40.0, 281.0, 30.0), np.arange(40.0, 201.0, 30.0))
+    )
+    pixels = np.vstack([[[160.0, row]], np.column_stack([u, v])])
+    pixels = pixels[(np.abs(pixels - pixels[0]).max(axis=1) > 29.0) | (np.arange(len(pixels)) == 0)]
+    bits = np.random.default_rng(1).integers(0, 256, (len(pixels), 32)).astype(np.uint8)
+    points = [Keypoints(pixels, bits), Keypoints(pixels - [10.0, 0.0], bits)]
+    settings = FrontendSettings()
+    engine = DescriptorFrontend(CAMERA, settings, "orb", lambda *images: points, MutualNearest())
+    still = _blobs()
+    near = np.abs(np.indices(still.shape) - np.array([row, 160.0])[:, None, None]).max(axis=0) < 25
+    shifted = cv2.warpAffine(still, np.array([[1.0, 0, 0], [0, 1, moved_px]]), (WIDTH, HEIGHT))
+    seen = []
+    for k, left in enumerate((still, np.where(near, shifted, still))):
+        pair = [
+            np.rint(image).clip(0, 255).astype(np.uint8) for image in (left, np.roll(left, -10, 1))
+        ]
+        out = engine.process(StereoFrame(k, k * 10**8, *pair))
+        seen.append(out.observations)
+    first = seen[0].ids[np.abs(seen[0].z[:, :2] - pixels[0]).max(axis=1) < 1.0]
+    return len(first) == 1 and bool(np.isin(first, seen[1].ids)[0])
+
+
+def _is_compared(row: float) -> bool:
+    """Whether a key point in such a row is compared with those of the right image."""
+    bits = np.zeros((1, 32), np.uint8)
+    points = [Keypoints(np.array([[160.0 - shift, row]]), bits) for shift in (0.0, 10.0)]
+    compared: list[int] = []
+
+    def match(left: Keypoints, right: Keypoints, allowed: object) -> IntArray:
+        compared.append(len(left))
+        return np.zeros((0, 2), np.int64)
+
+    engine = DescriptorFrontend(CAMERA, FrontendSettings(), "orb", lambda *_: points, match)
+    image = _blobs().clip(0, 255).astype(np.uint8)
+    engine.process(StereoFrame(0, 0, image, image))
+    return compared[0] == 1
+
+
 KEYPOINTS: dict[str, tuple[Says, float, float]] = {
     "across: points": (lambda n: _across(count=int(n)), 14, 15),
     "across: share": (lambda x: _across(right=x), 0.36, 0.44),
     "across: depths": (lambda x: _across(depths=x), 0.45, 0.55),
     "across: disparities": (lambda x: not _across(off_px=x), 1.7, 2.3),
     "search": (lambda x: not _searched(x), 26.0, 34.0),
+    "follows": (lambda x: not _follows(x), 1.3, 1.7),
+    "border": (_is_compared, 7.7, 8.3),
 }
 
 

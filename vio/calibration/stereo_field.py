@@ -98,7 +98,8 @@ class _FitRules(NamedTuple):
 
 
 _FIT = _FitRules()
-_LINEARISED = (0, 4)  # of these steps: at the given rig and near the solution
+# of these steps: at the given rig and near the solution; the others find the same one
+_LINEARISED: Tolerance[tuple[int, int]] = (0, 4)
 _TEXT = {
     "wx": ("right camera turned by {} deg about its horizontal axis", 180 / np.pi, ".3f"),
     "wy": ("right camera turned by {} deg about its vertical axis", 180 / np.pi, ".3f"),

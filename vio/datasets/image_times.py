@@ -30,7 +30,6 @@ from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
 from vio.records import NS_PER_S, IntArray
 
 _LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
-_SLOWEST_S = 5.0  # between frames; times in milliseconds are further apart
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 _LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
 _TIMED = 100  # images, of which names that are times show it
@@ -393,7 +392,7 @@ def _file_of_times(layout: Layout) -> Path | None:
 def _slow_note(file: Path, times_ns: IntArray) -> tuple[str, ...]:
     """Doubt the unit of times that are further apart than those of any camera that moves."""
     apart_s = float(np.median(np.diff(times_ns))) / NS_PER_S if len(times_ns) > 1 else 0.0
-    if apart_s <= _SLOWEST_S:
+    if apart_s <= FRAME_PACE.most_s:  # times in milliseconds are further apart
         return ()
     return (
         f"{file}: frames are {apart_s:g} s apart, as its times are taken for seconds; if they are "

@@ -34,6 +34,9 @@ CameraKind: TypeAlias = Literal["stereo", "rgbd", "mono"]
 # as by a stereo pair of this baseline.
 MONO_UNIT_M = 0.1
 DEPTH_DISPARITY_PX = 0.5  # of a pair; less is within its noise, and gives no depth
+# coordinates of programs that count pixels from the corner of the first one, minus ours, which
+# count from its centre
+HALF_PX = 0.5
 
 
 class _BaselineRules(NamedTuple):

@@ -18,7 +18,7 @@ from vio.interop.ros import to_fixed_axes_covariance
 from vio.records import NS_PER_S, Landmarks
 
 _INSTALL = "foxglove-sdk>=0.30,<1"
-_FLOAT_BYTES = 4
+_FLOAT_BYTES = np.dtype(np.float32).itemsize
 
 
 def _messages() -> Any:

@@ -16,10 +16,10 @@ from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lenses.registry import LENSES
 from vio.geometry.lie import FloatArray, checked_transform, so3_hat
+from vio.geometry.stereo import HALF_PX
 from vio.interop.loading import checked_covariance, package
 
 _INSTALL = "pycolmap>=4.2,<5"
-_HALF_PX = 0.5  # COLMAP's pixel coordinates minus ours
 _LEFT = 1  # camera ids
 _RIGHT = 2
 
@@ -78,7 +78,7 @@ def to_camera(lens: CameraModel, camera_id: int = _LEFT) -> Any:
         )
     name, count = found
     coefficients = [*lens.coefficients, *[0.0] * (count - len(lens.coefficients))]
-    centre = [lens.cu + _HALF_PX, lens.cv + _HALF_PX]
+    centre = [lens.cu + HALF_PX, lens.cv + HALF_PX]
     return package("pycolmap", _INSTALL).Camera(
         camera_id=camera_id,
         model=name,
@@ -103,7 +103,7 @@ def from_camera(camera: Any) -> CameraModel:
             "model's images first"
         )
     fu, fv, cu, cv, *coefficients = np.asarray(camera.params).tolist()
-    centre = (cu - _HALF_PX, cv - _HALF_PX)
+    centre = (cu - HALF_PX, cv - HALF_PX)
     size = (int(camera.width), int(camera.height))
     return CameraModel(fu, fv, *centre, *size, known[name], tuple(coefficients))
 

@@ -12,12 +12,11 @@ import numpy as np
 
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import HALF_PX, StereoCamera
 from vio.interop.loading import checked_covariance, package
 from vio.records import Landmarks
 
 _INSTALL = ".[view]"
-_HALF_PX = 0.5  # rerun's pixel coordinates minus ours
 
 
 def to_transform3d(T_parent_child: FloatArray) -> Any:
@@ -40,7 +39,7 @@ def to_pinhole(camera: StereoCamera) -> Any:
     rr = package("rerun", _INSTALL)
     return rr.Pinhole(
         focal_length=[camera.fu, camera.fv],
-        principal_point=[camera.cu + _HALF_PX, camera.cv + _HALF_PX],
+        principal_point=[camera.cu + HALF_PX, camera.cv + HALF_PX],
         resolution=[camera.width, camera.height],
         camera_xyz=rr.ViewCoordinates.RDF,
     )

@@ -22,6 +22,7 @@ from vio.records import BoolArray, Image, IntArray
 Bits: TypeAlias = npt.NDArray[np.uint8]
 
 DESCRIPTOR_BYTES = 32
+MAX_BITS = 64  # in which the descriptors of one point differ: a quarter
 # of a keyframe; 30 kB, so that 10 minutes of driving (2000 keyframes) need 60 MB
 MAX_FEATURES = 600
 
@@ -55,7 +56,6 @@ class _KeyPointRules(NamedTuple):
     levels: int = 8  # pyramid of the detector: up to 3.6 times nearer
     scale: float = 1.2
     max_disparity_share: float = 0.4  # of the width
-    max_bits: int = 64  # in which the descriptors of one point differ: a quarter
 
 
 _KEY_POINTS = _KeyPointRules()
@@ -211,7 +211,7 @@ def _most_alike(i: IntArray, j: IntArray, a: Bits, b: Bits) -> tuple[IntArray, I
     order = np.lexsort((j, differing, i))
     rows, first = np.unique(i[order], return_index=True)
     best = order[first]
-    good = differing[best] <= _KEY_POINTS.max_bits
+    good = differing[best] <= MAX_BITS
     return rows[good], j[best[good]]
 
 

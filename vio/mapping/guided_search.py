@@ -22,7 +22,7 @@ from vio.calibration.stereo_field import DisplacementField
 from vio.geometry.lie import FloatArray, se3_inverse, so3_hat, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate
-from vio.mapping.features import KeyframeFeatures
+from vio.mapping.features import MAX_BITS, KeyframeFeatures
 from vio.mapping.loop_geometry import (
     MIN_DISPARITY_PX,
     Fitted,
@@ -43,7 +43,6 @@ from vio.records import IntArray
 class _Guidance(NamedTuple):
     """How points of a place are looked for."""
 
-    max_bits: int = 64  # in which the descriptors of one point differ: a quarter
     # by which the size of a feature differs from the predicted one: two and a half levels
     levels: float = 1.6
     # half of a window's side at the scale of its feature, where the pose is known
@@ -538,7 +537,7 @@ def _best_in_windows(
     radius = windows.radius
     z = features.z
     for i in range(len(uv)):
-        least = np.uint64(_GUIDANCE.max_bits + 1)
+        least = np.uint64(MAX_BITS + 1)
         j = np.searchsorted(z[:, 0], uv[i, 0] - radius[i])
         while j < len(z) and z[j, 0] <= uv[i, 0] + radius[i]:
             ratio = features.size_px[j] / windows.size_px[i]

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate
-from vio.mapping.features import KeyframeFeatures
+from vio.mapping.features import MAX_BITS, KeyframeFeatures
 from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Tolerance
 from vio.numerics.statistics import chi_square_quantile
@@ -38,7 +38,8 @@ class _Fitting:
     max_pairs: int = 200  # that enter the fit, which takes 4 ms then
     ransac_px: float = 4.0
     ransac_steps: int = 300
-    ransac_sure: float = 0.999
+    # that no better pose is left, at which sampling ends; at two thirds as many are found
+    ransac_sure: Tolerance[float] = 0.999
     same_m: float = 0.1  # by which both directions may differ; metres, beside a share of the depth
     same_deg: float = 3.0
     same_depth: float = 0.05
@@ -58,7 +59,6 @@ class _Fitting:
 
 
 _FITTING = _Fitting()
-_MAX_BITS = 64
 MIN_DISPARITY_PX = 1.0
 
 
@@ -85,7 +85,7 @@ def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
     least = bits[rows, best]
     bits[rows, best] = _FITTING.worse
     good = np.flatnonzero(
-        mutual & (least <= np.minimum(_MAX_BITS, _FITTING.ratio * bits.min(axis=1)))
+        mutual & (least <= np.minimum(MAX_BITS, _FITTING.ratio * bits.min(axis=1)))
     )
     return np.stack([good, best[good]], axis=1)
 

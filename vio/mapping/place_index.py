@@ -21,7 +21,7 @@ import numpy.typing as npt
 from vio.geometry.lie import FloatArray
 from vio.mapping.features import DESCRIPTOR_BYTES, Bits
 from vio.numerics.compiled import compiled
-from vio.numerics.kinds import Capacity
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.records import BoolArray, IntArray
 
 Words = npt.NDArray[np.uint16]
@@ -45,13 +45,15 @@ _NEIGHBOURS = 2
 class _TailRules(NamedTuple):
     """Keyframes that are compared without the index."""
 
-    # keyframes; a merge takes as long as the comparison with ten times as many
-    min_keyframes: int = 32
-    share: float = 1 / 16
+    # keyframes; a merge takes as long as the comparison with ten times as many, and scores are
+    # the same
+    min_keyframes: Capacity[int] = 32
+    share: Capacity[float] = 1 / 16
 
 
 _TAIL = _TailRules()
-_UNIT = 1 << 16  # of the weights
+# of the weights, which are integers: a score is right to a hundred thousandth
+_UNIT: Tolerance[int] = 1 << 16
 SEGMENT: Capacity[int] = 256  # keyframes whose words a file keeps in the order of the index
 
 

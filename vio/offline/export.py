@@ -11,8 +11,7 @@ import numpy as np
 
 from vio.files.meshes import ply_points
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera
-from vio.offline.colmap import HALF_PX
+from vio.geometry.stereo import HALF_PX, StereoCamera
 from vio.offline.colmap.model import (
     ColourArray,
     ModelImages,

@@ -24,7 +24,6 @@ Storage: TypeAlias = Literal["rosbag2", "mcap"]
 _NAME = "recording"
 # of metadata.yaml: readers of version 9 read it, those of before do not read 9
 _VERSION: Literal[8] = 8
-_FLOAT32 = 7  # sensor_msgs/PointField
 # sensor_msgs/Imu: the covariance of an orientation that is not measured
 _UNKNOWN = np.array([-1.0, *np.zeros(8)])
 _LATCHED = ("/tf_static",)  # a subscriber gets the last message however late it comes
@@ -140,10 +139,9 @@ class BagWriter:
         """Write points (M, 3) with standard deviations (M,) as a PointCloud2 of x y z sigma."""
         data = np.column_stack([points, sigmas]).astype("<f4")
         names = ("x", "y", "z", "sigma")
-        fields = [
-            self._make("sensor_msgs/msg/PointField", name, 4 * k, _FLOAT32, 1)
-            for k, name in enumerate(names)
-        ]
+        kind = "sensor_msgs/msg/PointField"
+        float32 = self._store.types[kind].FLOAT32
+        fields = [self._make(kind, name, 4 * k, float32, 1) for k, name in enumerate(names)]
         raw = np.frombuffer(data.tobytes(), dtype=np.uint8)
         row = 16 * len(data)
         self._put(

@@ -15,7 +15,7 @@ Reference: DepthAI's CalibrationHandler (`getCameraExtrinsics`, `getCameraIntrin
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -32,11 +32,12 @@ from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_
 _CM = 0.01  # metres
 _LEFT = 1  # sockets where none are stated
 _RIGHT = 2
-_IMU = -2  # stands for the IMU's socket
+_IMU = "imu"  # in the place of its socket
 # of `cameraType`, by its number
 _TYPES = ("perspective", "fisheye", "equirectangular", "radial division", "cylindrical")
 _SAME_SCALE = 0.01
 Blocks = Mapping[int, Mapping[str, Any]]
+Links: TypeAlias = dict[tuple[int | str, int | str], FloatArray]
 
 
 def matches(entries: Entries) -> bool:
@@ -119,10 +120,12 @@ def _camera(block: Mapping[str, Any], size: Size | None, where: str) -> CameraMo
         return camera_from_matrix(K, *used, model, coefficients_of(model, D))
 
 
-def _links(blocks: Blocks, imu: object, where: str) -> dict[tuple[int, int], FloatArray]:
+def _links(blocks: Blocks, imu: object, where: str) -> Links:
     """Return `T_to_from` (4, 4) by the sockets (to, from); the IMU has one of its own."""
-    links = {}
-    extrinsics = {socket: block.get("extrinsics") for socket, block in blocks.items()}
+    links: Links = {}
+    extrinsics: dict[int | str, object] = {
+        socket: block.get("extrinsics") for socket, block in blocks.items()
+    }
     for socket, stated in {**extrinsics, _IMU: imu}.items():
         if not isinstance(stated, dict):
             continue
@@ -142,9 +145,9 @@ def _transform(stated: Mapping[str, Any], where: str) -> FloatArray:
     return checked_transform(se3_from_parts(R, _CM * t), where)
 
 
-def _through(links: Mapping[tuple[int, int], FloatArray], to: int, start: int) -> FloatArray | None:
+def _through(links: Links, to: int | str, start: int | str) -> FloatArray | None:
     """Return `T_to_start` (4, 4) along the links; None: there is no way."""
-    reached = {start: np.eye(4)}
+    reached: dict[int | str, FloatArray] = {start: np.eye(4)}
     waiting = [start]
     while waiting:
         here = waiting.pop(0)

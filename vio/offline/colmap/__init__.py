@@ -19,7 +19,6 @@ except ImportError as _error:
         "install it with: pip install 'pycolmap>=4.2'"
     ) from _error
 
-HALF_PX = 0.5  # COLMAP's pixel coordinates minus ours
 SEED = 0
 SIFT_FEATURES = 1500  # per image
 

@@ -11,8 +11,7 @@ import pycolmap
 
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.geometry.stereo import StereoCamera
-from vio.offline.colmap import HALF_PX
+from vio.geometry.stereo import HALF_PX, StereoCamera
 from vio.offline.points import PointTracks
 from vio.records import IntArray
 
@@ -20,7 +19,7 @@ ColourArray = npt.NDArray[np.uint8]
 
 LEFT = 1  # camera ids
 RIGHT = 2
-RIG = 1
+RIG = LEFT  # as its reference
 _GRAY = 128  # of points without an image
 
 

@@ -12,7 +12,8 @@ import pycolmap
 
 from vio.calibration.stereo import RayMatches
 from vio.geometry.lie import FloatArray
-from vio.offline.colmap import HALF_PX, SEED, SIFT_FEATURES
+from vio.geometry.stereo import HALF_PX
+from vio.offline.colmap import SEED, SIFT_FEATURES
 from vio.offline.colmap.adjustment import adjustment_config, solve, solver_options
 from vio.offline.colmap.model import (
     LEFT,
@@ -39,7 +40,8 @@ class _PairRules(NamedTuple):
 
 
 _PAIRS = _PairRules()
-_VIRTUAL_SIZE = (1000, 1000)  # required by COLMAP; without effect
+# required by COLMAP; without effect
+_VIRTUAL_SIZE = (round(2 * _PAIRS.virtual_px), round(2 * _PAIRS.virtual_px))
 _VIRTUAL_PARAMS = (_PAIRS.virtual_px, _PAIRS.virtual_px, 0.0, 0.0)
 
 

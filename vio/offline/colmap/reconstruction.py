@@ -14,8 +14,8 @@ import numpy as np
 import pycolmap
 
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.geometry.stereo import StereoCamera
-from vio.offline.colmap import HALF_PX, SEED, SIFT_FEATURES
+from vio.geometry.stereo import HALF_PX, StereoCamera
+from vio.offline.colmap import SEED, SIFT_FEATURES
 from vio.offline.colmap.model import (
     ModelImages,
     mean_reprojection_error_px,
