@@ -209,7 +209,7 @@ def _metered_rays() -> list[int]:
 def _quickest_change() -> int:
     """Frames from a change of light to that of the exposure, at least."""
     delays: list[int] = []
-    for seed in range(9):
+    for seed in range(20):
         radiance = np.full((40, 4), 95.0)
         radiance[10:] *= 0.5
         shutter = _control(radiance, SensorEffects(auto_exposure=True), 0, seed)[0]
