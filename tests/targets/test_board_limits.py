@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -440,3 +441,9 @@ def test_markers_are_looked_for_at_whole_halves_and_quarters_of_an_image(target:
     for scale, grown_px in _looks(target):
         assert scale in {1.0, 0.5, 0.25}
         assert grown_px % 2 == 1
+
+
+def test_depths_are_stated_where_the_tutorial_says() -> None:
+    root = Path(__file__).resolve().parents[2]
+    page = (root / "docs" / "tutorials" / "target.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"\bat (\d+) m\b", page)) == {f"{verdict.DEPTH_M:g}"}
