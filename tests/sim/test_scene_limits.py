@@ -15,7 +15,7 @@ import pytest
 from vio.errors import SimulationError
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.records import IntArray, StereoFrame
-from vio.sim import exposure, people, scenarios, sequence, textures, world
+from vio.sim import exposure, people, render, scenarios, sequence, textures, world
 from vio.sim.effects import SensorEffects
 from vio.sim.export import _truth_csv
 from vio.sim.exposure import _control
@@ -310,6 +310,44 @@ def _demo_begins_m() -> float:
     return float(np.linalg.norm((p[0] - p[1])[:2]))
 
 
+def _flow_grid_px() -> float:
+    """Between the pixels at which optical flow is exact, of an image 480 pixels wide."""
+    nodes: list[FloatArray] = []
+
+    def correspondence(scene: Any, view: Any, other: Any, uv: FloatArray) -> Any:
+        nodes.append(uv)
+        raise ZeroDivisionError
+
+    times = SMALL.taken_ns
+    with (
+        patch.object(sequence, "correspondence", correspondence),
+        pytest.raises(ZeroDivisionError),
+    ):
+        SimulatedRecording(SMALL).flow(0, int(times[1]), int(times[2]))
+    return 480.0 / (len(np.unique(nodes[0][:, 0])) - 2)
+
+
+def _reach_knots() -> float:
+    """For how long a motion changes where one of its control points does: a spline's degree and
+    one more.
+    """
+    motion = hand_held(duration_s=4.0)
+    moved = motion.p_control.copy()
+    moved[len(moved) // 2, 0] += 1.0
+    times = np.arange(motion.start_ns, motion.end_ns, 5 * MS)
+    T = [motion_at(m, times).T_world_imu for m in (motion, replace(motion, p_control=moved))]
+    changed = times[np.abs(T[0] - T[1]).max(axis=(1, 2)) > 1e-12]
+    return float(np.ptp(changed)) * 1e-9 / motion.knot_s
+
+
+def test_samples_of_a_fine_pixel_are_in_rows_and_columns_of_their_own() -> None:
+    """Eight of them, symmetric about the middle."""
+    at = np.sort(render._FINE.astype(np.float64), axis=0)
+    assert at == pytest.approx(np.repeat((np.arange(8) - 3.5)[:, None] / 8, 2, axis=1))
+    places = {tuple(place) for place in render._FINE.tolist()}
+    assert places == {(-u, -v) for u, v in places}
+
+
 FIGURES: dict[str, tuple[Callable[[], float], float, float]] = {
     "wall: clearance": (_clear_m, 0.045, 0.055),
     "doors": (_doors, 10, 10),
@@ -338,8 +376,10 @@ FIGURES: dict[str, tuple[Callable[[], float], float, float]] = {
     "exposure: quickest": (_quickest_change, 2, 2),
     "blur: samples": (lambda: _blur_taps(50.0), 21, 21),
     "blur: spacing": (lambda: 2.0 * 6.0 / (_blur_taps(6.0) - 1), 1.1, 1.3),
+    "blur: exact flow": (_flow_grid_px, 15.0, 17.0),
     "oracle: in a cell": (_most_in_cell, 1, 1),
     "truth: steps": (_truth_s, 0.0045, 0.0055),
+    "motion: reach": (_reach_knots, 5.8, 6.1),
     "flight: outlier": (lambda: _rejected(0.0024), 1, 1),
     "flight: smoothing": (lambda: _rejected(0.0019), 0, 0),
     "flight: turned outlier": (lambda: _rejected(0.0, 0.012), 1, 1),
