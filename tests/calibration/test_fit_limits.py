@@ -26,11 +26,18 @@ from vio.calibration.pair_rotation import (
     rotation_by_rows,
 )
 from vio.calibration.stereo_field import disparity_off
+from vio.cameras.rectification_error import error_basis, vertical_disparity_terms
 from vio.cameras.rig import Rig
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray, se3_exp, transform_points
 from vio.geometry.stereo import project
-from vio.records import FIELD_TERMS, ROW_TERMS, FeatureTracks, StereoFieldEstimate
+from vio.records import (
+    FIELD_TERMS,
+    ROW_TERMS,
+    FeatureTracks,
+    StereoFieldEstimate,
+    imu_matrices,
+)
 
 Says = Callable[[float], bool]
 NONE: Any = None
@@ -456,3 +463,18 @@ TABLES = {
 def test_limits_of_calibrating(says: Says, below: float, above: float) -> None:
     assert not says(below)
     assert says(above)
+
+
+def test_terms_of_a_rectification_error_are_as_many_as_stated() -> None:
+    z = np.array([[100.0, 80.0, 90.0, 80.0]])
+    rows, common = vertical_disparity_terms(CAMERA, z)
+    assert f"(N, 4, {error_basis(CAMERA, z).shape[2]})" in str(error_basis.__doc__)
+    stated = str(vertical_disparity_terms.__doc__)
+    assert f"(N, {rows.shape[1]}) of right" in stated
+    assert f"(N, {common.shape[1]}) by" in stated
+
+
+def test_terms_of_an_imu_fill_its_matrices() -> None:
+    """Equation (A1): those of the accelerometer from the diagonal up, all of the gyro."""
+    by_term = np.array([imu_matrices(unit) for unit in np.eye(15)]) - np.eye(3)
+    assert (by_term.sum(axis=0) == [np.triu(np.ones((3, 3))), np.ones((3, 3))]).all()

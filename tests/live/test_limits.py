@@ -265,7 +265,9 @@ def _beats(within_s: float) -> int:
 
 
 def _is_lost(source: Any, within_s: float) -> bool:
-    """Whether a device from which nothing comes has gone after so many seconds."""
+    """Whether a device from which nothing comes has gone after so many seconds, as
+    `vio.sources.source` says.
+    """
     with _Clock() as clock:
         events: Iterator[Any] = source.events()
         try:

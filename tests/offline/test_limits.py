@@ -283,7 +283,7 @@ def _averaging_times() -> int:
 REST: dict[str, tuple[Says, float, float]] = {
     "time": (_rest, 280.0, 320.0),
     "gap": (lambda x: not _rest(400.0, x), 2.8, 3.2),
-    "shift": (lambda x: not _rest(400.0, 1.0, x), 7.5, 13.0),
+    "shift": (lambda x: not _rest(400.0, 1.0, x), 9.5, 13.0),
     "longest averages": (
         lambda x: allan_curve(np.zeros(9000) + 1e-9, 10.0).tau_s[-1] < x,
         90.0,

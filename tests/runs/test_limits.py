@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock, patch
@@ -29,6 +31,7 @@ from vio.runs.pipeline import _unread_line
 from vio.runs.recorder import RunRecorder
 from vio.view.annotated import AnnotatedImage
 from vio.view.live import RerunViewer, ViewedRig, age_colours
+from vio.view.stream import open_stream
 
 Says = Callable[[float], bool]
 
@@ -260,6 +263,27 @@ def _wide(width: int) -> StereoCamera:
     return StereoCamera(400.0, 400.0, 320.0, 240.0, 0.1, width, 480)
 
 
+def _outline_baselines() -> float:
+    """How far away the middle of the image of a cylinder camera is drawn."""
+    camera = replace(CAMERA, projection="cylinder")
+    with patch("rerun.LineStrips3D") as lines:
+        _viewer(camera)
+    border = lines.call_args.args[0][0]
+    depth = np.hypot(border[:, 1], border[:, 2])
+    return float(depth.min()) / camera.baseline_m
+
+
+def test_a_browser_is_led_to_reruns_usual_port() -> None:
+    rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    usual = re.search(r"defaults to (\d+)", rr.serve_web_viewer.__doc__ or "")
+    assert usual
+    with patch("rerun.serve_web_viewer") as serve, patch("rerun.RecordingStream") as stream:
+        stream.return_value.serve_grpc.return_value = "a"
+        address = open_stream("web", "a")[1]
+    assert str(serve.call_args.kwargs["web_port"]) == usual[1]
+    assert f":{usual[1]}/" in str(address)
+
+
 LIMITS: dict[str, tuple[Says, float, float]] = {
     "line: at first": (lambda x: line_due(0.0, x), 4.5, 5.5),
     "line: later": (lambda x: line_due(100.0, x), 18.0, 22.0),
@@ -292,6 +316,7 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "viewer: tail": (lambda n: _tail(int(n)) < n, 12, 13),
     "viewer: disparity": (_draws_point, 2.7, 3.3),
     "viewer: sigmas": (lambda x: _drawn_sigmas() < x, 2.7, 3.3),
+    "viewer: outline": (lambda x: _outline_baselines() < x, 4.5, 5.5),
     "viewer: old": (lambda n: _is_as_old_as_any(int(n)), 38, 40),
     "viewer: bytes": (lambda n: _bytes_of_image() < n, 5_500, 7_500),
     "compared: frames": (

@@ -232,7 +232,7 @@ FIGURES: dict[str, tuple[Callable[[], float], float, float]] = {
     "people: bob": (lambda: _amplitude(1), 0.0105, 0.015),
     "people: twist": (lambda: _amplitude(2), 0.068, 0.095),
     "people: lean": (lambda: _amplitude(3), 0.025, 0.036),
-    "people: aside": (lambda: _aside_m(1.0, 1.0), 0.6, 0.8),
+    "people: aside": (lambda: _aside_m(1.0, 1.0), 0.62, 0.78),
     "people: above": (lambda: _aside_m(3.0, 0.0), 1.0, 1.4),
     "people: way": (lambda: float(along_walks([LONG])[:, 2].mean()), 0.25, 0.35),
     "window: near": (lambda: _lit([0.0, 0.0, 0.05], [0.0, 0.0, -1.0]), 2.5, 3.5),

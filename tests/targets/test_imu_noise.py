@@ -13,7 +13,6 @@ from vio.datasets.yaml_files import imu_densities, read_yaml_file
 from vio.errors import DataError
 from vio.records import ImuRecord
 from vio.targets.noise import (
-    MOVING_FACTOR,
     allan_curve,
     axis_noise,
     measure_noise,
@@ -88,7 +87,7 @@ def test_the_command_writes_kalibrs_file(tmp_path: Path) -> None:
     assert main(["imu-noise", str(file), "--out", str(out), "--plot", str(plot)]) == 0
     densities = imu_densities(read_yaml_file(out), out)
     assert densities is not None
-    assert densities.gyro == pytest.approx(MOVING_FACTOR * 2e-4, rel=0.1)
+    assert densities.gyro == pytest.approx(5.0 * 2e-4, rel=0.1)  # as the tutorial says
     assert plot.stat().st_size > 10_000
 
 

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
 # in which compiled functions are loaded: left out of the CPU time a frame, as its wall times
 _WARM_FRAMES: Capacity[int] = 8
-_MAX_WARNINGS = 5
+_MAX_WARNINGS: Capacity[int] = 5  # of a run that its record keeps; no figure is made of them
 JOB = "job.json"
 RESULT = "result.json"
 _BODY = re.compile(r"^#\s*body:\s*(\S+)", re.MULTILINE)

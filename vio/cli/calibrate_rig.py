@@ -304,6 +304,7 @@ def _rows(found: CameraCalibration) -> list[tuple[str, str]]:
 
     from vio.geometry.lie import so3_log
     from vio.targets.bundle import layout_of
+    from vio.targets.verdict import DEPTH_M
 
     at = found.found.at
     layout = layout_of(at.cameras)
@@ -355,7 +356,7 @@ def _rows(found: CameraCalibration) -> list[tuple[str, str]]:
         )
         rows.append(
             (
-                "at 5 m",
+                f"at {DEPTH_M:g} m",
                 f"depth ± {1e3 * verdict.depth_m:.0f} mm; halves {1e3 * verdict.halves.depth_m:.0f} "
                 "mm; and as many per cent as the board's measured size is off",
             )

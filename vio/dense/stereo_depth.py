@@ -29,7 +29,6 @@ class _DepthRules:
     slant_box_px: int = 9  # over which the surface's direction is measured
     slant_step_px: int = 12
     min_slant: float = 0.05  # a road 1.6 m below the camera, 30 m ahead
-    fixed_point: float = 16.0  # parts of a pixel in OpenCV's disparities
 
 
 _DEPTH = _DepthRules()
@@ -62,11 +61,12 @@ class StereoMatcher:
 
     def depth(self, left: Image, right: Image) -> DepthImage:
         """Return the depth (H, W) of the left image's pixels (H, W), of gray images."""
+        import cv2
+
         # Columns left of the first disparity would stay unknown: the pair is continued there.
         pad = [np.pad(image, ((0, 0), (self._count, 0)), mode="edge") for image in (left, right)]
-        disparity = self._sgm.compute(*pad)[:, self._count :].astype(np.float32) / np.float32(
-            _DEPTH.fixed_point
-        )
+        matched = self._sgm.compute(*pad)[:, self._count :].astype(np.float32)
+        disparity = matched / np.float32(cv2.StereoMatcher_DISP_SCALE)
         # A match that lies left of the right image is one with the padding.
         inside = (disparity > 0.5) & (disparity <= np.arange(left.shape[1], dtype=np.float32))
         scale = np.float32(self._camera.fu * self._camera.baseline_m)

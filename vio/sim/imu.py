@@ -14,11 +14,12 @@ import numpy as np
 
 from vio.datasets.samples import velocity_samples
 from vio.geometry.lie import FloatArray
+from vio.imu.settings import DEFAULT_IMU
 from vio.records import S_PER_NS, ImuDensities, ImuRecord, IntArray, VelocitySample
 from vio.setting import setting
 from vio.sim.motion import MotionSpline, motion_at
 
-GRAVITY_MPS2 = 9.81
+GRAVITY_MPS2 = DEFAULT_IMU.gravity_mps2
 GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_MPS2])
 # EuRoC's figures
 ADIS16448 = ImuDensities(gyro=1.6968e-4, gyro_walk=1.9393e-5, accel=2.0e-3, accel_walk=3.0e-3)

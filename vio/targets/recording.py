@@ -30,7 +30,7 @@ from vio.datasets.videos import video_files
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel
 from vio.protocols import Dataset, Progress
-from vio.records import Image, ImuRecord, ImuSample
+from vio.records import NS_PER_S, Image, ImuRecord, ImuSample
 from vio.targets.corners import NO_CORNERS, CornerDetector, Corners, numbered_alike
 from vio.targets.views import View
 
@@ -40,7 +40,6 @@ MAX_FRAMES = 80  # in which the board is looked for, spread over the recording
 class _FrameRules(NamedTuple):
     """Which frames of a recording are used."""
 
-    assumed_step_ns: int = 1_000_000_000  # between the pairs of a folder of photographs
     min_motion_hz: float = 5.0  # of frames, where an IMU is calibrated
     max_motion_frames: int = 400
     measured_images: int = 5  # images whose size is measured
@@ -120,7 +119,7 @@ def _flat_pairs(path: Path) -> ImagePairs | None:
 
 
 def _folder_of_pairs(path: Path, pairs: ImagePairs) -> RawRecording:
-    times = [k * _FRAMES.assumed_step_ns for k in range(len(pairs))]
+    times = [k * NS_PER_S for k in range(len(pairs))]  # of photographs, which have no clock
 
     def load(chosen: Sequence[int]) -> Iterator[tuple[int, Images]]:
         for k in chosen:
