@@ -2,8 +2,8 @@
 # OpenCV 4.14.0 and 5.0.0: `fisheye.projectPoints` shows a point 95 degrees off the optical axis at the opposite side of the image,
 # where one at 85 degrees belongs, and `fisheye.undistortPoints` makes 90 degrees of every pixel beyond 90. Neither says so.
 # Guessed: the model is one of angles, so the lenses it is made for, of 190 to 200 degrees, work as far as the polynomial does.
-# Matters here: TUM-VI's lenses have 195 degrees. Points of a map that are drawn with it appear in the wrong half of the image, and
-# features near the border get one and the same angle. The lenses of this project use the angle itself, and go on beyond 90 degrees.
+# Matters here: points of a map that are drawn with it over the images of such a lens appear in the wrong half, and features near the
+# border get one and the same angle. The lenses of this project use the angle itself, and go on beyond 90 degrees.
 # Source: https://github.com/opencv/opencv/issues/19433, https://github.com/opencv/opencv/issues/26174; this run.
 set -euo pipefail
 folder=$(mktemp -d)
