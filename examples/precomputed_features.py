@@ -23,6 +23,6 @@ with tempfile.TemporaryDirectory() as folder:
     features = vio.open_dataset(Path(folder) / "run" / "observations.npz")
     for clones in (5, 11, 20):
         again = vio.run(features, vio.load_config(overrides=[f"msckf.clones={clones}"]))
-        end = again.trajectory.positions[-1]
+        x, y, z = again.trajectory.positions[-1]
         ms = 1e3 * again.wall_s / len(again.frames)
-        print(f"window of {clones:2d} frames: ends at {end.round(3)}, {ms:.1f} ms a frame")
+        print(f"window of {clones:2d} frames: {x:.3f} {y:.3f} {z:.3f} m, {ms:.1f} ms a frame")

@@ -36,7 +36,6 @@ def match_sift(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
     pr = np.array([points1[m.trainIdx].pt for m in good]).reshape(-1, 2)
     if len(pl) < 15:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    cv2.setRNGSeed(0)
     _, mask = cv2.findFundamentalMat(pl, pr, cv2.FM_RANSAC, _RANSAC_PX, 0.999)
     inlier = (
         np.zeros(len(pl), dtype=np.bool_) if mask is None else mask.reshape(-1).astype(np.bool_)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -127,3 +128,15 @@ def test_a_homography_turns_pixels() -> None:
     z = np.column_stack([ideal[:, 2:], np.ones(len(p))]) @ H.T
     away = z[:, :2] / z[:, 2:] - seen(p, turned, seed=5)[:, 2:]
     np.testing.assert_allclose(away, noise, atol=0.15)
+
+
+def test_opencvs_random_numbers_stay_the_callers() -> None:
+    """A seed set here would start the caller's sequence anew, and no function used here has one."""
+    p = points()
+    cv2.setRNGSeed(7)
+    expected = cv2.randu(np.zeros((1, 3)), 0, 1).copy()
+    cv2.setRNGSeed(7)
+    first = seen(p, deg(0, 0, 0))
+    second = seen(transform_points(MOVED, p), deg(0, 0, 0), seed=2)
+    assert rotation_by_motion(CAMERA, first, second, np.zeros(3)) is not None
+    np.testing.assert_array_equal(cv2.randu(np.zeros((1, 3)), 0, 1), expected)

@@ -101,6 +101,8 @@ def test_check_reads_places_too(tmp_path: Path) -> None:
 def test_a_session_is_dropped(tmp_path: Path) -> None:
     path = tmp_path / "a.map"
     _two_sessions(path)
+    with pytest.raises(DataError, match="has no session 2, but 0 to 1"):
+        drop_session(path, 2)
     facts = drop_session(path, 0)
     assert [s["source"] for s in facts["sessions"]] == ["another"]
     with closing(MapStore(path, read_only=True)) as store:
@@ -111,7 +113,7 @@ def test_a_session_is_dropped(tmp_path: Path) -> None:
         np.testing.assert_array_equal(store.features(1).z, _features(5).z)
         assert store.loops() == []
     for session in (0, 7):
-        with pytest.raises(DataError, match="name one of several"):
+        with pytest.raises(DataError, match="has session 0 alone"):
             drop_session(path, session)
 
 

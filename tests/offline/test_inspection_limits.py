@@ -225,3 +225,12 @@ def test_points_of_a_picture_are_limited() -> None:
     image = np.random.default_rng(0).integers(0, 255, (90, 120), dtype=np.uint8)
     image = cv2.resize(image, (480, 360), interpolation=cv2.INTER_CUBIC)
     assert 1300 < len(pictures.sift_points(image, image)) < 1700
+
+
+def test_opencvs_random_numbers_stay_the_callers() -> None:
+    """A seed set before the matching would start the caller's sequence anew, and serve nothing."""
+    cv2.setRNGSeed(7)
+    expected = cv2.randu(np.zeros((1, 3)), 0, 1).copy()
+    cv2.setRNGSeed(7)
+    assert _matching(0.0) == 200
+    np.testing.assert_array_equal(cv2.randu(np.zeros((1, 3)), 0, 1), expected)

@@ -48,7 +48,7 @@ LIMITS = {
     "docs/live.md": 1320,
     "docs/maps.md": 1340,
     "docs/math.md": 6330,
-    "docs/neighbours.md": 1250,
+    "docs/neighbours.md": 1350,
     "docs/notes/consistency.md": 880,
     "docs/recordings.md": 1750,
     "docs/results.md": 2950,

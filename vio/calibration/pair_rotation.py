@@ -280,7 +280,6 @@ def _start(seen: _SeenTwice, rotation: FloatArray) -> tuple[FloatArray, BoolArra
     p = np.stack([points[:, 0], points[:, 1], np.ones(len(d))], axis=1) / d[:, None]
     shared = np.zeros(_SHARED)
     shared[:3] = rotation
-    cv2.setRNGSeed(0)
     known, turn, shift, rows = cv2.solvePnPRansac(
         p, seen.later, np.eye(3), None, reprojectionError=_FIT.widths_px[4] / focal
     )

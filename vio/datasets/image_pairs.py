@@ -115,7 +115,8 @@ def readable_frames(
             if good:
                 _say_skipped(unsaid)
     if bad and not good:
-        raise DataError(f"none of {bad} frames can be used; the first: {first_bad}")
+        several = f"none of {bad} frames can be used; the first: " if bad > 1 else ""
+        raise DataError(f"{several}{first_bad}")
     if bad > _NAMED:
         logger.warning(
             "%d of %d frames were skipped; the first %d are named above", bad, bad + good, _NAMED

@@ -312,6 +312,5 @@ def sift_pairs(left: Image, right: Image) -> FloatArray:
     if len(near) < _PICTURES.min_matches:
         return np.zeros((0, 4))
     z = np.array([[*a.pt, *b.pt] for a, b in near], dtype=np.float64)
-    cv2.setRNGSeed(0)
     _, mask = cv2.findFundamentalMat(z[:, :2], z[:, 2:], cv2.FM_RANSAC, _PICTURES.ransac_px, 0.999)
     return z if mask is None else z[mask.ravel() > 0]

@@ -101,8 +101,10 @@ def drop_session(path: Path, session: int) -> dict[str, Any]:
         DataError: there is no such session, it is the only one, or the file cannot be used.
     """
     sessions, owner, _ = _outline(path)
-    if not 0 <= session < len(sessions) or len(sessions) == 1:
-        raise DataError(f"{path}: has sessions 0 to {len(sessions) - 1}; name one of several")
+    if len(sessions) == 1:
+        raise DataError(f"{path}: has session 0 alone, and no map is left without it")
+    if not 0 <= session < len(sessions):
+        raise DataError(f"{path}: has no session {session}, but 0 to {len(sessions) - 1}")
     return _keep(path, path, owner != session)
 
 

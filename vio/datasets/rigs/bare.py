@@ -47,7 +47,10 @@ def read_bare(path: Path, size: Size | None) -> Rig:
     if rows is None:
         raise CalibrationError(f"{path}: is neither 'fx fy cx cy' nor a matrix of 3 x 3 numbers")
     if size is None:
-        raise CalibrationError(f"{path}: states no image size; pass image_size=(W, H)")
+        raise CalibrationError(
+            f"{path}: states no image size; pass image_size=(W, H), or give a file that states it, "
+            "such as 'vio run FOLDER --save-calibration rig.yaml' writes"
+        )
     if len(rows) == 1:
         fx, fy, cx, cy, *bend = rows[0].tolist()
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
