@@ -16,7 +16,7 @@ import numpy as np
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import naming
 from vio.datasets.rigs.plausible import checked_rig
-from vio.datasets.rigs.source import Size
+from vio.datasets.rigs.source import Size, no_image_size
 from vio.errors import CalibrationError
 from vio.files.text import text_lines
 from vio.geometry.lie import FloatArray
@@ -47,10 +47,7 @@ def read_bare(path: Path, size: Size | None) -> Rig:
     if rows is None:
         raise CalibrationError(f"{path}: is neither 'fx fy cx cy' nor a matrix of 3 x 3 numbers")
     if size is None:
-        raise CalibrationError(
-            f"{path}: states no image size; pass image_size=(W, H), or give a file that states it, "
-            "such as 'vio run FOLDER --save-calibration rig.yaml' writes"
-        )
+        raise no_image_size(path)
     if len(rows) == 1:
         fx, fy, cx, cy, *bend = rows[0].tolist()
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -8,8 +8,7 @@ from vio.cameras.rig import Rig
 from vio.datasets.common import naming
 from vio.datasets.kitti import read_calibration, read_extrinsics
 from vio.datasets.rigs.plausible import checked_rig
-from vio.datasets.rigs.source import Size
-from vio.errors import CalibrationError
+from vio.datasets.rigs.source import Size, no_image_size
 from vio.files.text import text_lines
 from vio.geometry.lie import FloatArray
 
@@ -35,10 +34,7 @@ def kitti_rig(
         cameras = (0, 1) if any(line.startswith("P0:") for _, line in text_lines(path)) else (2, 3)
     calibration = read_calibration(path, cameras)
     if image_size is None:
-        raise CalibrationError(
-            f"{path}: states no image size; pass image_size=(W, H), or give a file that states it, "
-            "such as 'vio run FOLDER --save-calibration rig.yaml' writes"
-        )
+        raise no_image_size(path)
     c = calibration.camera
     T_cam0_imu = read_extrinsics(path.with_name("T_cam0_imu.txt"))
     T_left_imu = None if T_cam0_imu is None else calibration.T_left_cam0 @ T_cam0_imu

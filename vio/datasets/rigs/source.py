@@ -18,6 +18,14 @@ from vio.records import ImuDensities
 Size = tuple[int, int]
 
 
+def no_image_size(path: Path) -> CalibrationError:
+    """The error of a file of a format that states no image size, where the caller gives none."""
+    return CalibrationError(
+        f"{path}: states no image size; pass image_size=(W, H), or give a file that states it, "
+        "such as 'vio run FOLDER --save-calibration rig.yaml' writes"
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Source:
     """A calibration file, and what its caller knows of the images."""
