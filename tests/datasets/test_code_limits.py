@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.refused import is_refused
 from vio.datasets import gnss, gtsam, image_pairs, image_times, plain
 from vio.datasets.bags import storage_order
 from vio.datasets.bags.clock_steps import ClockStep, mended
@@ -32,21 +33,12 @@ from vio.datasets.tables import holds_readings
 from vio.datasets.tracks import tracks_from_dense
 from vio.datasets.tum_rgbd import published_camera
 from vio.datasets.unused import Layout
-from vio.errors import VioError
 from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, Recording
 from vio.records import observations as frame_observations
 
 Says = Callable[[float], bool]
 MS = 1_000_000
-
-
-def _is_refused(call: Callable[[], object]) -> bool:
-    try:
-        call()
-    except VioError:
-        return True
-    return False
 
 
 def _read_text(text: str, read: Callable[[Path], object]) -> Any:
@@ -137,7 +129,7 @@ def _has_fix(status: int) -> bool:
     bag.messages.return_value = [MagicMock()]
     bag.decoded.return_value = fix
     with patch.object(gnss, "Bag", lambda path: bag):
-        return not _is_refused(lambda: gnss._read_navsatfix(Path("a"), None))
+        return not is_refused(lambda: gnss._read_navsatfix(Path("a"), None))
 
 
 # Positions and tables
@@ -180,7 +172,7 @@ def _log_is_read(version: int) -> bool:
         write_observation_log(file, recording, seen, ())
         arrays = dict(np.load(file)) | {"version": np.int64(version)}
         np.savez(file, **arrays)
-        return not _is_refused(lambda: read_observation_log(file))
+        return not is_refused(lambda: read_observation_log(file))
 
 
 # Images
@@ -204,7 +196,7 @@ def _kitti_cameras(first: int, colour: bool) -> bool:
         for k in (first, first + 1):
             (Path(folder) / f"image_{k}").mkdir()
         found = []
-        if not _is_refused(lambda: found.append(plain._choose_cameras(Path(folder), colour))):
+        if not is_refused(lambda: found.append(plain._choose_cameras(Path(folder), colour))):
             return found == [(first, first + 1)]
     return False
 
@@ -328,7 +320,7 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
         1_005_250_000,
     ),
     "bag: fix": (lambda n: _has_fix(int(n)), -1, 0),
-    "oxts: columns": (lambda n: not _is_refused(lambda: _oxts([0.0] * int(n))), 29, 30),
+    "oxts: columns": (lambda n: not is_refused(lambda: _oxts([0.0] * int(n))), 29, 30),
     "oxts: column of accuracy": (lambda n: _oxts_sigma_m(int(n), 5.0) > 4.0, 22, 23),
     "oxts: least": (lambda x: _oxts_sigma_m(23, 0.0) < x, 0.021, 0.024),
     "IMU: columns": (lambda n: _could_be_imu(int(n)), 6, 7),

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.refused import is_refused
 from vio import config, setting, testing
-from vio.errors import VioError
 from vio.files import meshes
 from vio.files.stamps import FRAME_PACE
 from vio.files.trajectories import read_trajectory
@@ -30,14 +30,6 @@ from vio.sim.rigs import small_rig
 
 Says = Callable[[float], bool]
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def _is_refused(call: Callable[[], object]) -> bool:
-    try:
-        call()
-    except VioError:
-        return True
-    return False
 
 
 # Settings
@@ -57,11 +49,11 @@ def _config_is_read(megabytes: float) -> bool:
         file = Path(folder, "a.yaml")
         file.write_bytes(b"#" * round(1e6 * megabytes))
         with patch.object(config, "read_yaml", lambda text: {}):
-            return not _is_refused(lambda: config.load_config(file))
+            return not is_refused(lambda: config.load_config(file))
 
 
 def _setting_fits(value: float) -> bool:
-    return not _is_refused(lambda: setting._check("a", value, Range()))
+    return not is_refused(lambda: setting._check("a", value, Range()))
 
 
 # Rows and stamps
@@ -72,7 +64,7 @@ def _trajectory_is_read(columns: int) -> bool:
         file = Path(folder, "a.txt")
         rows = [" ".join([f"{k}.5", *["0.5"] * (columns - 1)]) for k in range(9)]
         file.write_text("\n".join(rows) + "\n")
-        return not _is_refused(lambda: read_trajectory(file))
+        return not is_refused(lambda: read_trajectory(file))
 
 
 def _unit_is_told(frames: int) -> bool:

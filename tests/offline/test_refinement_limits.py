@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.offline.test_limits import _run
+from tests.refused import is_refused
 from vio.calibration.stereo import RayMatches, RowResiduals, StereoEstimate
 from vio.cameras.rig import Rig
 from vio.errors import VioError
@@ -43,14 +44,6 @@ NONE: Any = None
 
 def _needing_colmap(module: str) -> Any:
     return pytest.importorskip(module, exc_type=ImportError)
-
-
-def _is_refused(call: Callable[[], object]) -> bool:
-    try:
-        call()
-    except VioError:
-        return True
-    return False
 
 
 # Calibration in motion
@@ -335,7 +328,7 @@ def _map_is_moved(sigmas: float) -> bool:
         result.estimates.__getitem__.return_value.stereo_field = None
         mapped = MagicMock(T_map_body=np.tile(np.eye(4), (3, 1, 1)))
         mapped.in_map.frame = np.arange(3)
-        return not _is_refused(lambda: map_adjustment._adjusted(result, mapped, lambda: None))
+        return not is_refused(lambda: map_adjustment._adjusted(result, mapped, lambda: None))
 
 
 # Self-calibration

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.board_views import GRID, LEFT, Flaws, made_views
+from tests.refused import is_refused
 from vio.errors import DataError, VioError
 from vio.geometry.lie import FloatArray
 from vio.records import ImuDensities, ImuRecord
@@ -30,14 +31,6 @@ from vio.targets.views import Sightings, sightings
 
 Says = Callable[[float], bool]
 CHARUCO = Target("charuco", 6, 6, 0.08, 0.7, "DICT_5X5_1000")
-
-
-def _is_refused(call: Callable[[], object]) -> bool:
-    try:
-        call()
-    except VioError:
-        return True
-    return False
 
 
 # Growth from corner to corner
@@ -104,7 +97,7 @@ def _counts_in_prediction(neighbour: int) -> bool:
 
 
 def _is_board(count: int = 6, size_m: float = 0.08) -> bool:
-    return not _is_refused(lambda: Target("aprilgrid", count, 2, size_m, 0.3))
+    return not is_refused(lambda: Target("aprilgrid", count, 2, size_m, 0.3))
 
 
 def _border_modules(target: Target) -> int:
@@ -274,11 +267,11 @@ def _rates(step_s: float) -> int:
         raise DataError("a")
 
     with patch.object(inertial, "align_gyro", align_gyro):
-        _is_refused(_problem(step_s=step_s).start)
+        is_refused(_problem(step_s=step_s).start)
     return counts[0]
 
 
-def _contradiction_is_refused(sigma_deg: float) -> bool:
+def _contradictionis_refused(sigma_deg: float) -> bool:
     """Whether an IMU is refused that contradicts the poses, where its rotation is known so well."""
     problem = _problem()
     states = SimpleNamespace()
@@ -334,7 +327,7 @@ def _views_of_lens_choice(views: int) -> int:
     seen = Sightings(GRID.points_m, views, 1, n, zero, zero, np.zeros((2 * views, 2)))
     counts: list[int] = []
     with patch.object(lenses, "_scores", lambda few, *_: counts.append(few.views)):
-        _is_refused(lambda: lenses.choose_lens(seen, (752, 480)))
+        is_refused(lambda: lenses.choose_lens(seen, (752, 480)))
     return counts[0]
 
 
@@ -415,9 +408,9 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "marker: blurred": (lambda x: _correlation(blur_modules=x) > 0.999, 0.6, 0.7),
     "clocks: offset": (lambda x: _first_offset_s(x) > 0.0, 0.048, 0.052),
     "clocks: motions": (lambda n: _first_offset_s(intervals=int(n)) > 0.0, 19, 20),
-    "IMU: views": (lambda n: not _is_refused(lambda: _problem(int(n))), 19, 20),
+    "IMU: views": (lambda n: not is_refused(lambda: _problem(int(n))), 19, 20),
     "IMU: rates": (lambda x: _rates(x) == 0, 0.95, 1.05),
-    "IMU: hopeless": (_contradiction_is_refused, 9.5, 10.5),
+    "IMU: hopeless": (_contradictionis_refused, 9.5, 10.5),
     "lens: views": (lambda n: _views_of_lens_choice(int(n)) < n, 16, 17),
     "adjusted: corners": (lambda n: _is_used(int(n)), 3, 4),
     "adjusted: behind": (lambda x: _residual_behind_px() < x, 90.0, 110.0),

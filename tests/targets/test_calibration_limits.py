@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.board_views import GRID, LEFT
-from vio.errors import VioError
+from tests.refused import is_refused
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.targets import calibrate, corners, diagnosis, lenses, recording, seeds
 from vio.targets.bundle import MEDIAN_TO_SIGMA, BoardAdjustment
@@ -40,14 +40,6 @@ from vio.targets.verdict import (
 from vio.targets.views import Sightings, View
 
 Says = Callable[[float], bool]
-
-
-def _is_refused(call: Callable[[], object]) -> bool:
-    try:
-        call()
-    except VioError:
-        return True
-    return False
 
 
 # Corners
@@ -154,7 +146,7 @@ def _check_views(views: int = 20, count: int = 20) -> bool:
         patch.object(calibrate, "_diagnosis", lambda *_: None),
         patch.object(calibrate, "clearly_other_board", lambda *_: None),
     ):
-        return not _is_refused(lambda: calibrate._check_views(filmed, GRID))
+        return not is_refused(lambda: calibrate._check_views(filmed, GRID))
 
 
 def _used_views(views: int) -> int:
@@ -171,19 +163,19 @@ def _used_views(views: int) -> int:
     return chosen_views(seen).views
 
 
-def _fit_is_refused(residual_px: float, reason: str | None) -> bool:
+def _fitis_refused(residual_px: float, reason: str | None) -> bool:
     adjusted: Any = SimpleNamespace(residuals_px=np.tile([residual_px, 0.0], (9, 1)))
     with patch.object(calibrate, "_diagnosis", lambda *_: reason):
-        return _is_refused(lambda: calibrate._check_fit(adjusted, 0, _filmed(), GRID))
+        return is_refused(lambda: calibrate._check_fit(adjusted, 0, _filmed(), GRID))
 
 
-def _pair_is_refused(refused: float = 0.0, off_px: float = 0.1, turn_deg: float = 0.0) -> bool:
+def _pairis_refused(refused: float = 0.0, off_px: float = 0.1, turn_deg: float = 0.0) -> bool:
     used = np.arange(1000) >= round(1000 * refused)
     T = se3_from_parts(so3_exp([np.radians(turn_deg), 0.0, 0.0]), np.array([-0.1, 0.0, 0.0]))
     at = SimpleNamespace(T_cam_cam0=np.stack([np.eye(4), T]))
     found: Any = SimpleNamespace(used=used, sigma_px=np.array([off_px]), at=at)
     with patch.object(calibrate, "_shown_twice", lambda *_: None):
-        return _is_refused(lambda: calibrate._check_pair(found, _filmed(), GRID))
+        return is_refused(lambda: calibrate._check_pair(found, _filmed(), GRID))
 
 
 def _rival_is_named(off_px: float, sigma_px: float = 0.0) -> bool:
@@ -526,11 +518,11 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "views: corners": (lambda n: _check_views(count=int(n)), 11, 12),
     "views: used": (lambda n: _used_views(int(n)) < n, 60, 61),
     "views: differ": (lambda x: calibrate._places(_filmed(0.0, x), 0) > 1, 1.9, 2.1),
-    "fit: doubtful": (lambda x: _fit_is_refused(x, "a"), 0.45, 0.55),
-    "fit: refused": (lambda x: _fit_is_refused(x, None), 2.8, 3.2),
-    "pair: corners": (lambda x: _pair_is_refused(x), 0.28, 0.32),
-    "pair: off": (lambda x: _pair_is_refused(off_px=x), 2.8, 3.2),
-    "pair: turned": (lambda x: _pair_is_refused(turn_deg=x), 58.0, 62.0),
+    "fit: doubtful": (lambda x: _fitis_refused(x, "a"), 0.45, 0.55),
+    "fit: refused": (lambda x: _fitis_refused(x, None), 2.8, 3.2),
+    "pair: corners": (lambda x: _pairis_refused(x), 0.28, 0.32),
+    "pair: off": (lambda x: _pairis_refused(off_px=x), 2.8, 3.2),
+    "pair: turned": (lambda x: _pairis_refused(turn_deg=x), 58.0, 62.0),
     "lens: differs": (_rival_is_named, 0.09, 0.11),
     "lens: differs in sigmas": (lambda x: _rival_is_named(x, 1.0), 1.9, 2.1),
     "frames: with an IMU": (lambda x: _wanted(x) > _wanted(0.0), 15.0, 17.0),
