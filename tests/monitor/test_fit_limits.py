@@ -101,7 +101,7 @@ def _is_fitted(windows: int) -> bool:
 
 
 def _is_final(windows: int) -> bool:
-    check = InertialCheck(CAMERA, np.eye(4))
+    check = InertialCheck(CAMERA, np.eye(4), extrinsics_known=False)
     size: Any = SimpleNamespace(unit=1.0)
     fit: Any = SimpleNamespace(count=100)
     nothing: Any = None
@@ -165,7 +165,7 @@ def _gyro_says(
         S_gg=I3,
     )
     evidence = _evidence(gyro_fit=fit, clipped=clipped)
-    return [f.fault for f in gyro.judge_gyro(evidence, 1.0, turns=False)]
+    return [f.fault for f in gyro.judge_gyro(evidence, 1.0)]
 
 
 def _agrees(unexplained: float) -> bool:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from vio.geometry.lie import FloatArray, so3_exp
-from vio.monitor.force_fit import Evidence
+from vio.monitor.gyro import turned_finding
 from vio.monitor.gyro_fit import GyroFit
-from vio.monitor.turned_imu import judge_turn, turn_of_gyro, turned_finding
+from vio.monitor.turned_imu import Turn, judge_turn, turn_of_gyro
 
 R_GIVEN = so3_exp([0.4, -1.1, 0.7])
 AXIS = np.array([0.36, 0.48, 0.8])
@@ -31,13 +31,13 @@ def _fit(
     )  # fmt: skip
 
 
-def _evidence(fit: GyroFit, *, clipped: bool = False) -> Evidence:
-    return Evidence(R_GIVEN, fit, None, None, True, clipped, False)
+def _judged(fit: GyroFit, *, clipped: bool = False) -> Turn | None:
+    return judge_turn(fit, R_GIVEN, clipped=clipped)
 
 
 def _found(deg: float, *, noise: float = 0.0, count: int = 200, clipped: bool = False) -> bool:
     fit = _fit(np.radians(deg) * AXIS, noise=noise, count=count)
-    return judge_turn(_evidence(fit, clipped=clipped)) is not None
+    return _judged(fit, clipped=clipped) is not None
 
 
 @pytest.mark.parametrize("deg", [0.0, 2.0, 12.0, 35.0])
@@ -84,10 +84,10 @@ def test_a_turn_needs_intervals_rotation_about_two_axes_and_readings_in_range() 
     assert not _found(8.0, clipped=True)
     fit = _fit(np.radians(8.0) * AXIS)
     flat = fit.S_cc * np.outer([1.0, 1e-4, 1e-4], [1.0, 1e-4, 1e-4])
-    assert judge_turn(_evidence(replace(fit, S_cc=flat))) is None
+    assert _judged(replace(fit, S_cc=flat)) is None
     flat = fit.S_cc * np.outer([1.0, 1.0, 1e-4], [1.0, 1.0, 1e-4])
-    assert judge_turn(_evidence(replace(fit, S_cc=flat))) is not None
-    assert judge_turn(_evidence(replace(fit, unexplained=0.3))) is None
+    assert _judged(replace(fit, S_cc=flat)) is not None
+    assert _judged(replace(fit, unexplained=0.3)) is None
 
 
 def test_the_finding_states_the_rotation_and_turns_the_readings() -> None:

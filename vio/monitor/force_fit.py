@@ -11,14 +11,13 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, se3_exp, so3_exp
-from vio.monitor.gyro_fit import AGREES, GyroFit
+from vio.monitor.gyro_fit import AGREES, FIRST_EVALUATION, GyroFit
 from vio.monitor.motion import Record
+from vio.monitor.turned_imu import Turn
 from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import jackknife
 from vio.records import BoolArray
 
-# intervals before the first evaluation; there are fewer only at the end of a short run
-FIRST_EVALUATION = 60
 WINDOW_S = 2.0
 MIN_WINDOWS = 3  # for all but axes that are clearly wrong
 
@@ -104,6 +103,8 @@ class Evidence:
     # readings at the end of the range were found, which make rotations appear smaller
     clipped: bool
     last: bool  # no later evaluation will follow
+    # of the IMU against `R_cam0_imu`; None: not clearly, or a filter estimates it
+    turn: Turn | None = None
 
     @property
     def brief(self) -> bool:

@@ -16,7 +16,7 @@ from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import AXES_WORSE, axes_text, signed_permutations
 from vio.monitor.force_fit import Evidence
 from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit
-from vio.monitor.turned_imu import judge_turn, turned_finding
+from vio.monitor.turned_imu import Turn
 
 
 class _ExcessRules(NamedTuple):
@@ -42,19 +42,16 @@ class _Explanation:
     explanation: str
 
 
-def judge_gyro(evidence: Evidence, unit: float, *, turns: bool = True) -> list[InertialFinding]:
+def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     """Compare the gyro's rates, mapped by the given rotation, with the camera's; forces times
     `unit` are m/s^2.
-
-    Without `turns`, a rotation that is off by degrees is left to the filter to estimate.
     """
     gyro_fit = evidence.gyro_fit
     R = evidence.R_cam0_imu
     brief = evidence.brief
-    turn = judge_turn(evidence) if turns else None
-    if turn is not None:
-        C = so3_exp(turn.rotation) @ R
-        return [turned_finding(turn, R), *_judge_scale(evidence, C)]
+    if evidence.turn is not None:
+        C = so3_exp(evidence.turn.rotation) @ R
+        return [turned_finding(evidence.turn, R), *_judge_scale(evidence, C)]
     if gyro_fit.unexplained > _EXCESS.disagreeing_share:
         return [] if brief else [_disagreement(gyro_fit)]
     limit = max(
@@ -232,9 +229,23 @@ def _free_explanations(S_cg: FloatArray) -> Iterator[_Explanation]:
     )
 
 
-def _matrix_text(R: FloatArray) -> str:
-    return "[" + ", ".join(_triple_text(row) for row in R) + "]"
+def turned_finding(turn: Turn, R_cam0_imu: FloatArray) -> InertialFinding:
+    """The finding of a turn against the given rotation (3, 3)."""
+    degrees = np.degrees(np.linalg.norm(turn.rotation))
+    R = so3_exp(turn.rotation) @ R_cam0_imu
+    turned = R_cam0_imu.T @ turn.rotation
+    return InertialFinding(
+        "extrinsics rotation",
+        f"the gyro is turned by {degrees:.1f} deg against the camera, beyond the given T_cam0_imu "
+        f"(standard deviation {np.degrees(turn.sigma):.1g} deg)",
+        f"the rotation of T_cam0_imu should be {_matrix_text(R, 4)}; run `vio calibrate`",
+        turn_rad=(float(turned[0]), float(turned[1]), float(turned[2])),
+    )
 
 
-def _triple_text(v: npt.NDArray[np.floating]) -> str:
-    return f"[{v[0]:.3f}, {v[1]:.3f}, {v[2]:.3f}]"
+def _matrix_text(R: FloatArray, digits: int = 3) -> str:
+    return "[" + ", ".join(_triple_text(row, digits) for row in R) + "]"
+
+
+def _triple_text(v: npt.NDArray[np.floating], digits: int = 3) -> str:
+    return f"[{v[0]:.{digits}f}, {v[1]:.{digits}f}, {v[2]:.{digits}f}]"

@@ -34,6 +34,8 @@ class _RateRules(NamedTuple):
 _RATES = _RateRules()
 # share of the rotation that the best linear map leaves unexplained: below, explanations are judged
 AGREES = 0.2
+# intervals before the first evaluation; there are fewer only at the end of a short run
+FIRST_EVALUATION = 60
 _NEAR_OFFSETS_S = np.linspace(-MAX_FOLLOWED_OFFSET_S, MAX_FOLLOWED_OFFSET_S, 21)
 FAR_OFFSETS_S = np.arange(-5.0, 5.001, 0.025)
 

@@ -19,11 +19,18 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.imu.clocks import SampleCoverage
 from vio.imu.findings import InertialFault, InertialFinding
-from vio.monitor.force_fit import FIRST_EVALUATION, MIN_WINDOWS, Evidence, fit_force
-from vio.monitor.gyro_fit import GyroFit, fit_gyro, judge_offset, judge_stamps
+from vio.monitor.force_fit import MIN_WINDOWS, Evidence, fit_force
+from vio.monitor.gyro_fit import (
+    FIRST_EVALUATION,
+    GyroFit,
+    fit_gyro,
+    judge_offset,
+    judge_stamps,
+)
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.monitor.rotation_comparison import compare_rotations, judge_rotations
 from vio.monitor.samples import Samples, Size, is_long_enough, judge_size
+from vio.monitor.turned_imu import Turn, judge_turn
 from vio.records import (
     ROTATION_NOT_COMPARABLE,
     S_PER_NS,
@@ -48,6 +55,8 @@ class _EvaluationRules(NamedTuple):
 
 
 _EVALUATIONS = _EvaluationRules()
+# frames in which an IMU that is in doubt may have been wrong: that it was judged by
+_BEFORE_A_DOUBT = 2 * FIRST_EVALUATION
 
 
 class InertialCheck:
@@ -74,6 +83,7 @@ class InertialCheck:
         self._coverage = SampleCoverage()
         self._frames = 0
         self._jumped = False
+        self.compared_since = 0  # first frame since the gyro's bias has last jumped
         self._size_judged = False  # at least for the time being
         # a magnitude that is not that of gravity, by the first readings, while its cause is not known
         self._odd_size = ""
@@ -102,15 +112,20 @@ class InertialCheck:
         """What makes the IMU useless if it is confirmed; nothing: there is no such doubt."""
         return self._odd_size or self._fault
 
-    def begin_after_jump(self) -> None:
-        """Restart where the gyro's bias has jumped, as no linear map fits readings before and
-        after it.
+    def begin_after_jump(self, index: int) -> None:
+        """Restart where the gyro's bias has jumped at a frame, as no linear map fits readings before
+        and after it.
 
         Only once in a run: wrong axes or units look like jumps, too, one after the other.
         """
+        self.compared_since = index
         if not self._jumped:
             self._jumped = True
             self.reset()
+
+    def doubted_since(self, index: int) -> int:
+        """The first frame in which an IMU may have been wrong that is in doubt at one."""
+        return max(self.compared_since, index - _BEFORE_A_DOUBT)
 
     def imu(self, samples: Sequence[ImuSample]) -> None:
         """Add samples in order of time."""
@@ -173,8 +188,8 @@ class InertialCheck:
         self._since_evaluation = 0
         judged = self._judge(last=False)
         confirmed = [f for f in judged if f.fault in self._suspected]
-        offsets = [f.offset_s for f in confirmed if f.offset_s is not None]
-        self.clock_offset_s = offsets[0] if offsets else None
+        offsets = (f.offset_s for f in confirmed if f.offset_s is not None)
+        self.clock_offset_s = next(offsets, None)
         self._suspected = {f.fault for f in judged}
         found += confirmed
         return found
@@ -221,9 +236,21 @@ class InertialCheck:
             or size.unit is None
             or last
             or gyro_fit.count >= _EVALUATIONS.enough_intervals,
-            clipped=self.clipped or "saturation" in self._reported,
+            clipped=self._is_clipped,
             last=last,
+            turn=self._turn(gyro_fit),
         )
+
+    @property
+    def _is_clipped(self) -> bool:
+        """Whether readings were at the end of the range."""
+        return self.clipped or "saturation" in self._reported
+
+    def _turn(self, gyro_fit: GyroFit) -> Turn | None:
+        """The turn of the IMU against its calibration; none where the filter estimates it."""
+        if not self._turns:
+            return None
+        return judge_turn(gyro_fit, self._T[:3, :3], clipped=self._is_clipped)
 
     def _judge_stationary(self, size: Size, record: Record, *, last: bool) -> list[InertialFinding]:
         """Judge without rotation: the magnitude of the readings and, at the end, the direction
@@ -253,13 +280,12 @@ class InertialCheck:
 
         gyro_fit = evidence.gyro_fit
         size = resolve_size(size, evidence)
-        rotation = judge_gyro(evidence, size.unit or 1.0, turns=self._turns)
+        rotation = judge_gyro(evidence, size.unit or 1.0)
         found = self._judge_size_and_rates(size, record, gyro_fit, rotation)
         forces, measured = self._judge_force(evidence, size, rotation)
         found += forces
         # which of gyro and extrinsics is at fault may be open yet
-        final = replace(evidence, force_final=True)
-        self._doubt_if([*found, *judge_gyro(final, size.unit or 1.0, turns=self._turns)])
+        self._doubt_if([*found, *judge_gyro(replace(evidence, force_final=True), size.unit or 1.0)])
         self.imu_at_fault |= _shows_fault(found, evidence)
         force_is_settled = measured or size.unit is None or bool(rotation)
         enough = force_is_settled and _has_enough_rotation(gyro_fit)
@@ -328,10 +354,17 @@ class InertialCheck:
             return
         from vio.monitor.gyro import judge_gyro
 
-        clipped = self.clipped or "saturation" in self._reported
-        # what axes and unit are at fault is not asked yet
-        evidence = Evidence(self._T[:3, :3], gyro_fit, None, None, True, clipped, False)
-        self._doubt_if(judge_gyro(evidence, 1.0, turns=self._turns))
+        evidence = Evidence(
+            R_cam0_imu=self._T[:3, :3],
+            gyro_fit=gyro_fit,
+            force=None,
+            early_force=None,
+            force_final=True,  # what axes and unit are at fault is not asked yet
+            clipped=self._is_clipped,
+            last=False,
+            turn=self._turn(gyro_fit),
+        )
+        self._doubt_if(judge_gyro(evidence, 1.0))
 
     def _compare_rotations(self, record: Record, gyro_fit: GyroFit) -> list[InertialFinding]:
         """Compare the camera's rotation with the gyro's until they differ beyond doubt."""

@@ -18,7 +18,6 @@ from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import AS_READ
 from vio.imu.findings import ImuVerdict
 from vio.monitor.contradiction import ImuContradiction
-from vio.monitor.force_fit import FIRST_EVALUATION
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RefusalReport, RunHealth, is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
@@ -41,8 +40,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _DOUBT = "imu-in-doubt"
-# frames in which an IMU that is in doubt may have been wrong: that it was judged by
-_BEFORE_A_DOUBT = 2 * FIRST_EVALUATION
 # groups of faults without whose cure one camera finds no scale
 _PREVENTS_START = ("size", "overlap")
 
@@ -93,7 +90,6 @@ class RunMonitor:
         self._waits_for = ""
         self._imu_at_fault = False
         self._scale_lines: list[Finding] = []  # not reported yet
-        self._compared_since = 0  # first frame that IMU and images are compared for
         self.imu_verdict = ImuVerdict()  # by the findings so far
         self.findings: list[Finding] = []
         # whether the run begins again once more of its right images can be put right
@@ -278,9 +274,9 @@ class RunMonitor:
         """
         was_used = self._refusals.imu
         self._goes_on(index, verdict)
-        if verdict.used or not was_used:
+        if self._inertial is None or verdict.used or not was_used:
             return
-        since = max(self._compared_since, index - _BEFORE_A_DOUBT)
+        since = self._inertial.doubted_since(index)
         message = f"frame {index}: since frame {since} the estimate may have followed a wrong IMU"
         self._add([Finding("estimate-implausible", message, index, since)])
 
@@ -360,15 +356,15 @@ class RunMonitor:
             self._add(self._contradiction.frame(index, report.innovation_ratio))
             self._integrity.take_innovation(report.innovation_ratio)
         if report.gyro_jump_radps is not None and self._inertial is not None:
-            self._inertial.begin_after_jump()
-            self._compared_since = index
+            self._inertial.begin_after_jump(index)
         self._integrity.take_scale_doubt(index, report.scale_doubt)
         if self._seen is not None:
             self._add(self._refusals.frame(self._seen, report, estimate))
         self._scale_lines += self._health.scale(index, estimate)
         if self._inertial is not None:
             offset_s = self._inertial.clock_offset_s
-            apart = self._health.clock(index, estimate, offset_s, self._compared_since)
+            since = self._inertial.compared_since
+            apart = self._health.clock(index, estimate, offset_s, since)
             self._add(apart)
             if apart and self.can_begin_again:  # by images alone; else the filter is begun anew
                 self.imu_verdict = replace(self.imu_verdict, usable=False)

@@ -12,9 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.geometry.lie import FloatArray, so3_exp
-from vio.imu.findings import InertialFinding
-from vio.monitor.force_fit import FIRST_EVALUATION, Evidence
-from vio.monitor.gyro_fit import AGREES, GyroFit
+from vio.monitor.gyro_fit import AGREES, FIRST_EVALUATION, GyroFit
 from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import jackknife
 
@@ -28,7 +26,7 @@ class _TurnRules(NamedTuple):
     # Healthy recordings come to 1.1 (images rendered along flights of EuRoC, their real IMU, turns
     # about two axes) and calibrations by hand to 3; 4 cost a filter eight times its accuracy.
     min_deg: float = 3.5
-    # beyond it, axes that were exchanged or the inverse transform are likelier
+    # beyond it, swapped axes or the inverse transform are likelier
     max_deg: float = 40.0
     sigmas: float = 6.0  # standard deviations of the turn, in its most uncertain direction
 
@@ -74,35 +72,20 @@ def _fit(camera: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[Floa
     return rotation, scale
 
 
-def judge_turn(evidence: Evidence) -> Turn | None:
+def judge_turn(gyro_fit: GyroFit, R_cam0_imu: FloatArray, *, clipped: bool) -> Turn | None:
     """Return the turn of an IMU whose calibration is clearly wrong by degrees; None: it is not,
     or too little is known of it.
+
+    Args:
+        gyro_fit: the gyro's rates beside the camera's.
+        R_cam0_imu: (3, 3) as given.
+        clipped: readings were at the end of the range, which shortens and turns the rates.
     """
-    gyro_fit = evidence.gyro_fit
     is_known = gyro_fit.unexplained < AGREES and gyro_fit.axes > 1
     used = int(np.count_nonzero(gyro_fit.weight))
-    if not is_known or used < FIRST_EVALUATION or evidence.clipped:
+    if not is_known or used < FIRST_EVALUATION or clipped:
         return None
-    turn = turn_of_gyro(gyro_fit, evidence.R_cam0_imu)
+    turn = turn_of_gyro(gyro_fit, R_cam0_imu)
     angle = float(np.linalg.norm(turn.rotation))
     is_turn = np.radians(_TURN.min_deg) < angle < np.radians(_TURN.max_deg)
     return turn if is_turn and angle > _TURN.sigmas * turn.sigma else None
-
-
-def turned_finding(turn: Turn, R_cam0_imu: FloatArray) -> InertialFinding:
-    """The finding of a turn against the given rotation (3, 3)."""
-    degrees = np.degrees(np.linalg.norm(turn.rotation))
-    R = so3_exp(turn.rotation) @ R_cam0_imu
-    rows = ", ".join("[" + ", ".join(f"{x:.4f}" for x in row) + "]" for row in R)
-    seen = (
-        f"the gyro is turned by {degrees:.1f} deg against the camera, beyond the given T_cam0_imu "
-        f"(standard deviation {np.degrees(turn.sigma):.1g} deg)"
-    )
-    remedy = f"the rotation of T_cam0_imu should be [{rows}]; run `vio calibrate`"
-    turned = R_cam0_imu.T @ turn.rotation
-    return InertialFinding(
-        "extrinsics rotation",
-        seen,
-        remedy,
-        turn_rad=(float(turned[0]), float(turned[1]), float(turned[2])),
-    )
