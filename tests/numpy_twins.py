@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
+from vio.filters.imu_terms import accel_D_terms, gyro_D_terms
 from vio.filters.multiview import CAUCHY, MIN_DEPTH, MIN_DISPARITY_PX, TrackInformation
 from vio.filters.track_records import InverseDepth, Residuals, Views
 from vio.frontend.align import FLAT_RMS, Templates, disc, offsets, window
 from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
-from vio.records import BoolArray
+from vio.records import BoolArray, IntArray
 
 PRIOR = 1e-6  # per px^2, on a disparity: that of `vio.filters.multiview`
 ROW_WEIGHT = (4.0 / 0.3) ** 2  # gray levels and pixels: those of `frontend.align`
@@ -518,11 +519,16 @@ def moved_velocities(
     R: FloatArray,
     error: FloatArray,
     velocities: FloatArray,
+    entries: IntArray,
 ) -> FloatArray:
-    """Velocities (N, 3) of the past, moved by a present error (15,): (N2) back, with the
-    accelerometer's bias.
+    """Velocities (N, 3) of the past, moved by a present error (15 + I,): (N2) back, with the
+    accelerometer's bias and terms of the IMU.
     """
     xi_v = (free_flow(-ages_s, gravity) @ error[:9])[:, 6:9] + ages_s[:, None] * (R @ error[12:15])
+    if len(entries):
+        impulse = velocities[-1] - velocities - ages_s[:, None] * gravity
+        by_terms = accel_D_terms((R.transpose(0, 2, 1) @ impulse[..., None])[..., 0]) @ error[15:]
+        xi_v = xi_v - (R @ by_terms[..., None])[..., 0]
     out: FloatArray = velocities @ so3_exp(error[3:6]).T + xi_v @ so3_left_jacobian(error[3:6]).T
     return out
 
@@ -562,6 +568,32 @@ def integrated(
         for s, M in zip(variance, (moved[:, :, 3:], moved[:, :, :3]), strict=True)
     ]
     return R, p, v, np.einsum("kij,k->ij", moved, dt), np.array(Q)
+
+
+def term_columns(
+    times: FloatArray,
+    levers: FloatArray,
+    R: FloatArray,
+    p: FloatArray,
+    v: FloatArray,
+    gravity: FloatArray,
+) -> FloatArray:
+    """How errors of the IMU's terms move position, attitude and velocity (9, 15), (A3).
+
+    Levers (K, 6) `[gyro, accel]`; rotations, positions and velocities as `integrated` returns them.
+    """
+    dt = np.diff(times)[:, None, None] * 1e-9
+    left = (times[-1] - 0.5 * (times[:-1] + times[1:])) * 1e-9
+    force = R @ accel_D_terms(levers[:, 3:])
+    by_accel = 0.5 * (force[1:] + force[:-1]) * dt
+    middle = 0.5 * (R[1:] + R[:-1])
+    by_gyro = middle @ gyro_D_terms(0.5 * (levers[1:, :3] + levers[:-1, :3])) * dt
+    enters = np.zeros((len(dt), 9, 15))
+    enters[:, 0:3] = so3_hat(0.5 * (p[1:] + p[:-1])) @ by_gyro
+    enters[:, 3:6] = by_gyro
+    enters[:, 6:9] = so3_hat(0.5 * (v[1:] + v[:-1])) @ by_gyro + by_accel
+    out: FloatArray = (free_flow(left, gravity) @ enters).sum(axis=0)
+    return out
 
 
 def point_D_pose(p_world: FloatArray) -> FloatArray:

@@ -185,6 +185,7 @@ class Scenario:
             max_landmarks=self.landmarks,
             pixel_sigma_px=self.pixel_sigma_px,
             calibrate_camera_imu="none",  # the other variants know the errors of the motion alone
+            calibrate_imu="off",
             calibrate_stereo="off",
             stereo_baseline_sigma=0.0,
             stereo_focal_sigma=0.0,  # the rig is exact

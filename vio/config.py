@@ -340,8 +340,8 @@ def _converted(value: Any, hint: Any) -> Any:
 def _chosen(value: Any, choices: tuple[Any, ...], path: str, where: str) -> Any:
     """Return the value where it is one of the choices, or raise."""
     # YAML reads the bare words as truth values
-    if isinstance(value, bool) and {"on", "off"} <= set(choices):
-        value = "on" if value else "off"
+    if isinstance(value, bool) and (word := "on" if value else "off") in choices:
+        value = word
     if value in choices and type(value) in {type(c) for c in choices}:
         return value
     near = difflib.get_close_matches(_short(str(value)), choices, 1)

@@ -502,13 +502,14 @@ IMU_ENTRIES = (
     *((1, *at) for at in (*_UPPER, (1, 0), (2, 0), (2, 1))),
 )
 _SENSORS, _ROWS, _COLUMNS = np.array(IMU_ENTRIES).T
+_IDENTITIES = np.tile(np.eye(3), (2, 1, 1))
 
 
 def imu_matrices(terms: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return `M_a` and `M_g` (3, 3) of equation (A1), which take readings to truth plus bias,
     from 15 terms.
     """
-    M = np.tile(np.eye(3), (2, 1, 1))
+    M = _IDENTITIES.copy()
     M[_SENSORS, _ROWS, _COLUMNS] += terms
     return M[0], M[1]
 

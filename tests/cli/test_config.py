@@ -30,6 +30,17 @@ def test_on_and_off_need_no_quotes(word: str, tmp_path: Path) -> None:
         assert load_config(_write(tmp_path, to_yaml(config))) == config
 
 
+@pytest.mark.parametrize("word", ["off", '"off"'])
+def test_off_beside_other_words_needs_no_quotes(word: str, tmp_path: Path) -> None:
+    for config in (
+        load_config(None, [f"msckf.calibrate_imu={word}"]),
+        load_config(_write(tmp_path, f"msckf:\n  calibrate_imu: {word}\n")),
+    ):
+        assert config.msckf.calibrate_imu == "off"
+    with pytest.raises(ConfigError, match="calibrate_imu is one of auto, off, scale, full"):
+        load_config(None, ["msckf.calibrate_imu=on"])
+
+
 def test_defaults_then_file_then_command_line(tmp_path: Path) -> None:
     path = _write(
         tmp_path, "vislam:\n  pixel_sigma_px: 2\n  iterations: 3\nselector:\n  name: information\n"

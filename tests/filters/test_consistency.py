@@ -22,7 +22,8 @@ def _window(motion: str) -> Window:
     """Three clones on a moving body and two landmarks."""
     rng = np.random.default_rng(0)
     nav = NavState(np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    model = ImuMotion(MsckfSettings()) if motion == "imu" else TwistMotion(MsckfSettings())
+    settings = MsckfSettings(calibrate_imu="off")
+    model = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
     window = Window(model, nav, np.eye(DIM) * 1e-3)
     for k in range(3):
         move = se3_exp(rng.normal(0, [0.5, 0.5, 0.5, 0.2, 0.2, 0.2]))

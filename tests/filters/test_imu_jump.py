@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from tests.filters.test_msckf import EXACT_RIG, STEP_NS, Flight
-from vio.filters.imu_jump import GyroJump, turn_of_images
+from vio.filters.imu_jump import GyroJump, _common_turn, turn_of_images
 from vio.filters.msckf import Msckf
+from vio.filters.noise import StepErrors
 from vio.filters.track_records import Residuals
 from vio.filters.window_tracks import LinearTracks
 from vio.geometry.lie import FloatArray, so3_exp
@@ -186,11 +187,54 @@ def test_a_bias_that_comes_back_has_not_jumped() -> None:
     assert jump.agrees(np.array([0.1, 0, 0])) is None
 
 
-@pytest.mark.parametrize(("rate", "alike"), [(0.19, True), (0.21, False)])
+@pytest.mark.parametrize(("rate", "alike"), [(0.149, False), (0.151, True)])
 def test_rates_are_alike_up_to_half_of_the_larger(rate: float, alike: bool) -> None:
     jump = GyroJump()
-    jump.repeats(np.array([0.1, 0.0, 0.0]))
+    jump.repeats(np.array([0.3, 0.0, 0.0]))
     assert jump.repeats(np.array([rate, 0.0, 0.0])) == alike
+
+
+@pytest.mark.parametrize(("degrees", "alike"), [(17.0, True), (19.5, False)])
+def test_a_rate_that_grows_in_its_direction_is_alike(degrees: float, alike: bool) -> None:
+    """What one step did not take back adds to the next."""
+    jump = GyroJump()
+    jump.repeats(np.array([0.1, 0.0, 0.0]))
+    angle = np.radians(degrees)
+    assert jump.repeats(0.3 * np.array([np.cos(angle), np.sin(angle), 0.0])) == alike
+
+
+E = np.diag([1e-2, 1e-2, 1e-2, 2e-8, 1e-8, 3e-8])
+
+
+def _steps(turns: FloatArray, gain: float) -> list[StepErrors]:
+    """Steps over which images showed rotations (N, 3), of which a filter has taken a share."""
+    left = E.copy()
+    left[3:, 3:] *= 1.0 - gain
+    zero = np.zeros(3)
+    return [StepErrors(np.concatenate([zero, gain * turn]), E, E, left) for turn in turns]
+
+
+@pytest.mark.parametrize(("sigmas", "shown"), [(0.98, False), (1.02, True)])
+def test_small_corrections_in_one_direction_are_a_rate(sigmas: float, shown: bool) -> None:
+    """Of what images contradict, a filter that trusts its gyro corrects a twentieth; the sum has a
+    probability of 1e-5, and the rotation is that of the images.
+    """
+    limit = np.sqrt(25.9017 / 0.05 / 6 / 3 * np.diag(E)[3:])  # of each axis and step
+    turns = np.tile(sigmas * limit, (6, 1))
+    found = _common_turn(_steps(turns, 0.05))
+    assert (found is not None) == shown
+    if found is not None:
+        np.testing.assert_allclose(found, turns.sum(axis=0), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("share", "shown"), [(0.81, False), (0.86, True)])
+def test_corrections_in_all_directions_are_no_rate(share: float, shown: bool) -> None:
+    """The squared length of their sum must be 0.7 of that in one direction."""
+    one = 1e-2 * np.array([0.6, 0.0, 0.8])
+    other = 1e-2 * np.array([0.0, 1.0, 0.0])
+    across = np.sqrt(1.0 - share**2)
+    turns = np.array([share * one + (-1) ** k * across * other for k in range(6)])
+    assert (_common_turn(_steps(turns, 0.05)) is not None) == shown
 
 
 @pytest.mark.parametrize(("sigmas", "named"), [(2.9, False), (3.1, True)])

@@ -19,7 +19,15 @@ from vio.cli.running import _calibration_rows
 from vio.config import Config
 from vio.errors import ConfigError
 from vio.filters import imu_terms
-from vio.filters.imu_terms import CHOSEN, IMU_TERMS, accel_D_terms, gyro_D_terms, significant
+from vio.filters.imu_terms import (
+    CHOSEN,
+    IMU_TERMS,
+    accel_D_terms,
+    chosen_terms,
+    gyro_D_terms,
+    significant,
+)
+from vio.filters.mono_msckf import MonoMsckf
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import DIM, NO_STEP, ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
@@ -37,7 +45,7 @@ from vio.runs.folder import imu_calibration
 T_IMU_CAM0 = se3_inverse(T_CAM0_IMU)
 # the stereo pair
 EXACT = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
-OFF = replace(EXACT, calibrate_camera_imu="none")
+OFF = replace(EXACT, calibrate_camera_imu="none", calibrate_imu="off")
 FULL = replace(EXACT, calibrate_camera_imu="none", calibrate_imu="full")  # the terms alone
 GRAVITY = np.array([0.0, 0.0, -9.81])
 TERMS = np.random.default_rng(3).normal(0, 0.02, IMU_TERMS)
@@ -368,6 +376,39 @@ def test_terms_that_are_known_are_no_error_and_scales_alone_no_misalignment(
     )
 
 
+@pytest.mark.parametrize(
+    ("kind", "motion", "estimated"),
+    [
+        ("stereo", "imu", True),
+        ("rgbd", "imu", True),
+        ("mono", "imu", False),
+        ("stereo", None, False),
+    ],
+)
+def test_terms_are_estimated_by_default_where_a_pair_has_an_imu(
+    kind: CameraKind, motion: MotionSource | None, estimated: bool
+) -> None:
+    noise = np.random.default_rng(0)
+    flight = Shaking(3)
+    filt = build_backend(replace(CAMERA, kind=kind), T_CAM0_IMU, Config(), motion)
+    if motion is not None:
+        for sample in _samples(flight, np.zeros(15), noise):
+            filt.propagate(sample)
+    filt.update(flight.observe(0, 0.5, noise, 40))
+    terms = filt.estimate().imu_terms if kind != "mono" else None
+    assert (terms is not None) == estimated
+    if kind == "mono":
+        assert isinstance(filt, MonoMsckf)
+        assert filt._settings.calibrate_imu == "off"
+
+
+def test_extrinsics_leave_the_scales_to_be_estimated() -> None:
+    """The rotation from IMU to camera would trade against misalignments."""
+    for calibrate, chosen in (("none", "full"), ("time_offset", "full"), ("both", "scale")):
+        settings = MsckfSettings(calibrate_camera_imu=calibrate)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(chosen_terms(settings), CHOSEN[chosen])  # type: ignore[index]
+
+
 def test_off_carries_nothing() -> None:
     step = _motion(OFF).advance(replace(MOVING, imu_terms=np.zeros(15)), 0, 100_000_000)
     assert step.Phi_imu is None
@@ -379,7 +420,7 @@ def test_off_carries_nothing() -> None:
 )
 def test_says_what_it_needs(kind: CameraKind, motion: MotionSource | None, why: str) -> None:
     with pytest.raises(
-        ConfigError, match=rf"msckf.calibrate_imu: full needs .*{why}.*set it to off"
+        ConfigError, match=rf"msckf.calibrate_imu: full needs .*{why}.*set it to auto"
     ):
         build_backend(replace(CAMERA, kind=kind), T_CAM0_IMU, Config(msckf=FULL), motion)
 
@@ -443,3 +484,12 @@ def test_summary_and_metrics_state_the_terms() -> None:
         "accelerometer scale x +1.00 ± 0.05, y -1.00 ± 0.05, z +0.70 ± 0.05 %",
     )
     assert rows[1] == ("", "accelerometer misalignment 0.76 ± 0.05 deg")
+    unclear = replace(last, imu_terms_sigma=np.abs(OFF_BY_1_PERCENT) / 2.9)
+    stated = imu_calibration(SimpleNamespace(estimates=[unclear]))
+    assert not _calibration_rows({"stereo_scale": None, "camera_imu": None, "imu": stated})
+    turned = np.where(np.arange(15) == 3, np.radians(0.3), 0.0)  # x by y of the accelerometer
+    one = replace(last, imu_terms=turned, imu_terms_sigma=np.full(15, np.radians(0.09)))
+    stated = imu_calibration(SimpleNamespace(estimates=[one]))
+    assert _calibration_rows({"stereo_scale": None, "camera_imu": None, "imu": stated}) == [
+        ("IMU", "accelerometer misalignment 0.30 ± 0.16 deg")
+    ]

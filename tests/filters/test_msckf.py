@@ -47,7 +47,9 @@ from vio.records import (
     observations,
 )
 
-EXACT_RIG = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
+EXACT_RIG = MsckfSettings(
+    calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0, calibrate_imu="off"
+)
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(
     np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1])

@@ -19,7 +19,7 @@ from vio.imu.settings import DEFAULT_IMU, ImuSettings
 from vio.imu.standstill import NOISE_FACTOR, blocks_agree
 from vio.records import ImuSample, VelocitySample
 
-SETTINGS = MsckfSettings()
+SETTINGS = MsckfSettings(calibrate_imu="off")
 MOVING = NavState(
     se3_exp([3.0, -2.0, 1.0, 0.4, -0.8, 1.1]),
     np.array([1.0, -0.5, 0.3]),

@@ -21,6 +21,7 @@ from vio.cameras.projection import camera_args
 from vio.cameras.rectification_error import ErrorColumns
 from vio.datasets import png_rows
 from vio.filters import gate_loops, multiview, pose_loops, stereo_calibration, track_loops
+from vio.filters.imu_terms import ENTRIES, calibrated, gyro_D_terms
 from vio.filters.landmark_gate import leave_one_out_nis
 from vio.filters.track_records import (
     ErrorRows,
@@ -59,6 +60,7 @@ from vio.geometry.lie import (
 from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.guard import image_change
 from vio.numerics.compiled import Loop, eigenvectors, invert_positive, move_by_twist, solve_positive
+from vio.records import imu_matrices
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
 CAMERAS = {"pinhole": CAMERA, "cylinder": replace(CAMERA, projection="cylinder")}
@@ -398,7 +400,7 @@ def test_poses_and_velocities_move_as_in_numpy() -> None:
         se3_exp(rng.normal(size=6)),
         se3_exp(rng.normal(size=6)),
     )
-    eta, error, gravity = rng.normal(size=6), 0.1 * rng.normal(size=15), np.array([0.0, 0.0, -9.8])
+    eta, error, gravity = rng.normal(size=6), 0.1 * rng.normal(size=30), np.array([0.0, 0.0, -9.8])
     cameras, moves = np.empty(T.shape), np.zeros((5, 6))
     pose_loops.camera_poses(T_cam0_imu, T, cameras)
     np.testing.assert_allclose(cameras, T_cam0_imu @ se3_inverse(T), atol=1e-14)
@@ -410,11 +412,14 @@ def test_poses_and_velocities_move_as_in_numpy() -> None:
         pose_loops.move_points(phi, xi, p)
         np.testing.assert_allclose(p, expected, atol=1e-14)
     ages, velocities = np.arange(5) * 0.05, rng.normal(size=(5, 3))
-    expected = numpy_twins.moved_velocities(gravity, ages, T[:, :3, :3], error, velocities)
-    pose_loops.move_earlier_velocities(
-        gravity, ages, np.ascontiguousarray(T[:, :3, :3]), error, velocities
-    )
-    np.testing.assert_allclose(velocities, expected, atol=1e-13)
+    R = np.ascontiguousarray(T[:, :3, :3])
+    for entries in (ENTRIES[:0], ENTRIES):
+        moved = velocities.copy()
+        pose_loops.move_earlier_velocities(
+            gravity, ages, R, error[: 15 + len(entries)], entries, moved
+        )
+        expected = numpy_twins.moved_velocities(gravity, ages, R, error, velocities, entries)
+        np.testing.assert_allclose(moved, expected, atol=1e-13)
     rows, part = np.array([0, 2, 3]), np.empty((3, 3))
     pose_loops.take_rows(cameras[0], rows, part)
     np.testing.assert_array_equal(part, cameras[0][np.ix_(rows, rows)])
@@ -447,11 +452,17 @@ def test_the_imu_is_integrated_as_in_numpy() -> None:
         np.empty((15, 15)),
         np.array([1e-4, 2e-3]),
     )
+    levers = rng.normal(size=(12, 6))
+    columns = np.zeros((15, 15))
     pose_loops.integrate(
         *given[:4],
         pose_loops.ImuNoise(densities, walks, hidden),
+        pose_loops.TermColumns(levers, ENTRIES, columns),
         pose_loops.ImuStep(T, v, turned, Phi, Q, summed),
     )
+    expected = numpy_twins.term_columns(given[0], levers, R_k, p_k, v_k, gravity)
+    np.testing.assert_allclose(columns[:9], expected, atol=1e-13)
+    assert not columns[9:].any()
     np.testing.assert_allclose(T, se3_from_parts(R_k[-1], p_k[-1]), atol=1e-13)
     np.testing.assert_allclose(v, v_k[-1], atol=1e-13)
     gyro = readings[:, :3] - bias[:3]
@@ -475,6 +486,21 @@ def test_the_imu_is_integrated_as_in_numpy() -> None:
     pose_loops.interpolate(cuts, times, readings, found)
     np.testing.assert_array_equal(
         found, np.stack([np.interp(cuts, times, column) for column in readings.T], axis=1)
+    )
+
+
+def test_readings_are_calibrated_as_in_numpy() -> None:
+    rng = np.random.default_rng(23)
+    raw = rng.normal(size=(7, 6))
+    terms = rng.normal(0.0, 0.1, len(ENTRIES))
+    found = np.empty_like(raw)
+    pose_loops.calibrate(raw, ENTRIES, terms, found)
+    np.testing.assert_allclose(found, calibrated(raw, terms), rtol=1e-13)
+    M_gyro = imu_matrices(terms)[1]
+    D = np.empty((3, len(ENTRIES)))
+    pose_loops.write_terms_of_rate(M_gyro, raw[0, :3], ENTRIES, D)
+    np.testing.assert_allclose(
+        D, gyro_D_terms(np.linalg.solve(M_gyro, raw[0, :3])), rtol=1e-12, atol=1e-14
     )
 
 

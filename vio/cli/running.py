@@ -703,19 +703,30 @@ def _calibration_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [("cameras", ", ".join(scale))] if scale else []
     rows += [("IMU", line) for line in camera_imu_findings(metrics)]
     for sensor, own in (metrics.get("imu") or {}).items():
-        words = [
-            f"{axis} {value:+.2f} ± {own['scale_percent_sigma'][axis]:.2f}"
-            for axis, value in own.get("scale_percent", {}).items()
-        ]
-        if words:
-            rows.append(("IMU", f"{sensor} scale {', '.join(words)} %"))
-        if "misalignment_deg" in own:
-            size, sigma = (
-                math.hypot(*own[key].values())
-                for key in ("misalignment_deg", "misalignment_deg_sigma")
-            )
-            rows.append(("", f"{sensor} misalignment {size:.2f} ± {sigma:.2f} deg"))
+        rows += _imu_rows(sensor, own)
     return rows
+
+
+def _imu_rows(sensor: str, own: dict[str, dict[str, float]]) -> list[tuple[str, str]]:
+    """What is clearly wrong with the scales and axes of one sensor of the IMU."""
+    rows = []
+    if _is_clear(own, "scale_percent"):
+        sigmas = own["scale_percent_sigma"]
+        words = [
+            f"{axis} {v:+.2f} ± {sigmas[axis]:.2f}" for axis, v in own["scale_percent"].items()
+        ]
+        rows.append(("IMU", f"{sensor} scale {', '.join(words)} %"))
+    if _is_clear(own, "misalignment_deg"):
+        size = math.hypot(*own["misalignment_deg"].values())
+        sigma = math.hypot(*own["misalignment_deg_sigma"].values())
+        rows.append(("" if rows else "IMU", f"{sensor} misalignment {size:.2f} ± {sigma:.2f} deg"))
+    return rows
+
+
+def _is_clear(own: dict[str, dict[str, float]], kind: str) -> bool:
+    """Whether one of the terms of a kind is beyond three standard deviations."""
+    sigmas = own.get(f"{kind}_sigma", {})
+    return any(abs(v) > 3 * sigmas[axis] for axis, v in own.get(kind, {}).items())
 
 
 def _map_row(of_map: dict[str, Any]) -> str:

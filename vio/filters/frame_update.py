@@ -139,6 +139,10 @@ class FrameUpdate:
                 tracks, fitted, pixels, trusted = again
             if trusted and not propagation.since_frame.bridged:
                 propagation.noise.update(step)
+                if self._has_imu and self._gyro_jump.doubts_lasting(
+                    window, step, propagation.since_frame
+                ):
+                    tracks, fitted = self.fit.fit(window, tracks, pixels, innovation)
         propagation.end_step()
 
         tracks = self.fit.tracks.without_wrong_views(tracks)

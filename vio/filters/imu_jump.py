@@ -18,11 +18,19 @@ import numpy as np
 
 from vio.filters.multiview import CAUCHY
 from vio.filters.navigation import Growth, NavState
+from vio.filters.noise import (
+    ROTATION,
+    SLIGHTLY_INFORMED,
+    StepErrors,
+    turn_shown,
+    whitened_correction,
+)
 from vio.filters.track_records import Residuals
 from vio.filters.window import Window
 from vio.filters.window_tracks import VIEW_PROBABILITY, LinearTracks, chi_square_table
 from vio.geometry.lie import FloatArray, so3_hat
 from vio.numerics.kinds import Tolerance
+from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray
 
 
@@ -54,9 +62,34 @@ class _JumpRules(NamedTuple):
     changed_sigmas: float = 3.0  # of the bias before: less is no jump
     # of the larger one: rates of two steps that differ by less are one jump
     alike_share: float = 0.5
+    # … or that are turned by less against each other (cosine) and grow: what was not taken back in
+    # one step adds to the next
+    alike_direction: float = 0.95
 
 
 _JUMP = _JumpRules()
+
+
+class _LastingRules(NamedTuple):
+    """When corrections of several steps show one wrong rate, each of them too small to show it.
+
+    A gyro is known far better than what the images of one step show, so that they correct little of
+    a small jump.
+    """
+
+    # newest ones that are summed, those of a large and of a small jump
+    few_steps: int = 5
+    steps: int = 10
+    # chi-square probability beyond which the sum is an exception; simulated flights and drives
+    # with drawn rigs come to 16 of 3 degrees of freedom, jumps of 0.03 rad/s to 60 in five steps
+    probability: float = 0.99999
+    # of the squared length that corrections in one direction would sum to; 1 / steps where they
+    # have nothing in common
+    min_coherence: float = 0.7
+
+
+_LASTING = _LastingRules()
+_LASTING_LIMIT = chi_square_quantile(_LASTING.probability, np.arange(1, 4)).tolist()
 
 
 def turn_of_images(
@@ -126,6 +159,8 @@ class GyroJump:
         self._steps = 0  # of the filter since its start
         self._off = deque[bool](maxlen=_JUMP.quiet_steps + _JUMP.newest_steps)  # which were off
         self._rate: FloatArray | None = None  # (3,) that the last step was off by
+        # the newest steps, and how long they took
+        self._recent = deque[tuple[StepErrors, float]](maxlen=_LASTING.steps)
         # (3,) the bias before it was doubted, and its standard deviations then; None: it is not
         self._before: tuple[FloatArray, FloatArray] | None = None
 
@@ -180,12 +215,39 @@ class GyroJump:
         window.inflate_process_noise(_gyro_doubt(growth, window.nav, turn, seconds))
         return True
 
+    def doubts_lasting(self, window: Window, step: StepErrors, growth: Growth) -> bool:
+        """Take the correction of a step that the images do not contradict; return whether they
+        show one wrong rate with those before, by which the bias becomes uncertain then.
+
+        Args:
+            window: whose newest step it is.
+            step: its correction.
+            growth: of the state's error over the step.
+        """
+        if not self._settled:
+            return False
+        self._recent.append((step, window.last_step_s))
+        for count in (_LASTING.few_steps, _LASTING.steps):
+            newest = list(self._recent)[-count:]
+            turn = None if len(newest) < count else _common_turn([step for step, _ in newest])
+            if turn is not None:
+                seconds = sum(seconds for _, seconds in newest)
+                self.doubt(window.nav.gyro_bias, np.sqrt(np.diag(window.prior.P)[9:12]))
+                window.inflate_process_noise(_gyro_doubt(growth, window.nav, turn, seconds))
+                self._recent.clear()
+                return True
+        return False
+
     def is_settled(self, *, off: bool) -> bool:
         """Take a step, and whether the images contradict it; return whether the start, which learns
         bias and tilt, is over, and the steps before agreed.
         """
         self._steps += 1
         self._off.append(off)
+        return self._settled
+
+    @property
+    def _settled(self) -> bool:
         before = list(self._off)[: -_JUMP.newest_steps]
         return self._steps > _JUMP.start_steps and sum(before) <= _JUMP.max_off_steps
 
@@ -197,8 +259,11 @@ class GyroJump:
         self._rate = rate
         if last is None:
             return False
-        size = max(float(np.linalg.norm(rate)), float(np.linalg.norm(last)))
-        return float(np.linalg.norm(rate - last)) < _JUMP.alike_share * size
+        size = float(np.linalg.norm(rate))
+        before = float(np.linalg.norm(last))
+        if float(np.linalg.norm(rate - last)) < _JUMP.alike_share * max(size, before):
+            return True
+        return size > before and float(rate @ last) > _JUMP.alike_direction * size * before
 
     def doubt(self, bias: FloatArray, sigma: FloatArray) -> None:
         """Take the bias (3,) and its standard deviations (3,) as they were before they are
@@ -220,6 +285,23 @@ class GyroJump:
         self._before = None
         changed = float(np.linalg.norm(bias - before))
         return changed if changed > _JUMP.changed_sigmas * float(np.linalg.norm(sigma)) else None
+
+
+def _common_turn(steps: list[StepErrors]) -> FloatArray | None:
+    """Return the rotation (3,) over some steps that their corrections show as one wrong rate; None:
+    they show none.
+    """
+    total = steps[0]
+    for step in steps[1:]:
+        total = total + step
+    test = whitened_correction(total, ROTATION, SLIGHTLY_INFORMED)
+    if not test.dof or test.squared < _LASTING_LIMIT[test.dof - 1]:
+        return None
+    corrections = np.array([step.correction[ROTATION] for step in steps])
+    lengths = float(np.sum(corrections**2)) * len(steps)
+    if float(np.sum(total.correction[ROTATION] ** 2)) < _LASTING.min_coherence * lengths:
+        return None
+    return turn_shown(total)
 
 
 def _is_old(at: Residuals) -> BoolArray:

@@ -15,7 +15,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray, so3_exp, so3_hat
+from vio.filters.pose_loops import shrink_to_signal
+from vio.filters.settings import MsckfSettings
+from vio.geometry.lie import FloatArray, so3_hat
 from vio.records import IMU_ENTRIES, IntArray, imu_matrices
 
 ImuTerms = Literal["off", "scale", "full"]
@@ -45,7 +47,8 @@ class _TermPriors(NamedTuple):
 
 
 _PRIORS = _TermPriors()
-_SENSOR, _ROW, _COLUMN = np.array(IMU_ENTRIES).T
+ENTRIES: IntArray = np.array(IMU_ENTRIES)  # (15, 3) sensor, row and column of each
+_SENSOR, _ROW, _COLUMN = ENTRIES.T
 # Random walk of the terms per root second, over their initial standard deviation: by their data
 # sheets, consumer accelerometers and gyros change by 0.02 to 0.03 % a degree, so two degrees in a
 # hundred seconds are 0.05 %.
@@ -56,6 +59,17 @@ CHOSEN: dict[ImuTerms, IntArray] = {
     "scale": np.flatnonzero(_ROW == _COLUMN),
     "full": np.arange(IMU_TERMS),
 }
+
+
+def chosen_terms(settings: MsckfSettings) -> IntArray:
+    """Return which terms are estimated of a pair with an IMU.
+
+    Where the rotation from IMU to camera is estimated, too, it would trade against misalignments.
+    """
+    which = settings.calibrate_imu
+    if which == "auto":
+        which = "scale" if settings.calibrate_camera_imu in ("extrinsics", "both") else "full"
+    return CHOSEN[which]
 
 
 def term_sigmas() -> FloatArray:
@@ -72,13 +86,6 @@ def calibrated(readings: FloatArray, terms: FloatArray) -> FloatArray:
     """
     M_accel, M_gyro = imu_matrices(terms)
     return np.concatenate([readings[..., :3] @ M_gyro.T, readings[..., 3:] @ M_accel.T], axis=-1)
-
-
-def raw_rate(rate: FloatArray, terms: FloatArray) -> FloatArray:
-    """Return what the gyro reads (3,) where that is `rate` (3,), bias included, by equation
-    (A1).
-    """
-    return np.asarray(np.linalg.solve(imu_matrices(terms)[1], rate), dtype=np.float64)
 
 
 def accel_D_terms(accel: FloatArray) -> FloatArray:
@@ -117,56 +124,9 @@ def significant(
         seconds: length of the interval.
         densities: (2,) white noise of accelerometer and gyro.
     """
-    moved = readings - usual
-    mean = moved.mean(axis=0)
-    for part, density in ((slice(0, 3), densities[1]), (slice(3, 6), densities[0])):
-        squared = float(mean[part] @ mean[part]) * seconds / density**2
-        moved[:, part] *= np.sqrt(max(1 - _LEVER.clear_of_noise / max(squared, 1e-9), 0.0))
-    return usual + moved
-
-
-def term_columns(
-    times_ns: FloatArray,
-    raw: FloatArray,
-    readings: FloatArray,
-    T_world_imu: FloatArray,
-    velocity: FloatArray,
-    gravity: FloatArray,
-) -> FloatArray:
-    """How errors of the terms move the navigation state's error (15, 15) over an interval, equation
-    (A3).
-
-    Args:
-        times_ns: (K,) of the readings, from the interval's start to its end.
-        raw: (K, 6) readings `[gyro, accel]`.
-        readings: (K, 6) the same, calibrated and less the biases.
-        T_world_imu: (4, 4) at the start.
-        velocity: (3,) there, world, m/s.
-        gravity: (3,) world, m/s^2.
-    """
-    dt = np.diff(times_ns)[:, None] * 1e-9
-    left = (times_ns[-1] - 0.5 * (times_ns[1:] + times_ns[:-1]))[:, None, None] * 1e-9
-    R = _attitudes(T_world_imu[:3, :3], so3_exp(0.5 * (readings[1:, :3] + readings[:-1, :3]) * dt))
-    force = np.einsum("kij,kj->ki", R, readings[:, 3:])
-    a = 0.5 * (force[1:] + force[:-1]) + gravity
-    v = velocity + np.cumsum(np.concatenate([np.zeros((1, 3)), a * dt]), axis=0)
-    moved = (v[:-1] + 0.5 * a * dt) * dt
-    p = T_world_imu[:3, 3] + np.cumsum(np.concatenate([np.zeros((1, 3)), moved]), axis=0)
-    pm = 0.5 * (p[1:] + p[:-1])[:, :, None]
-    vm = 0.5 * (v[1:] + v[:-1])[:, :, None]
-    g = gravity[:, None]
-
-    # In the middle of each step: what an error of the terms does to the world's force and rate.
-    by_accel = R @ accel_D_terms(raw[:, 3:])
-    by_accel = 0.5 * (by_accel[1:] + by_accel[:-1]) * dt[:, :, None]
-    middle = 0.5 * (R[1:] + R[:-1])
-    by_gyro = middle @ gyro_D_terms(0.5 * (raw[1:, :3] + raw[:-1, :3])) * dt[:, :, None]
-    out = np.zeros((15, IMU_TERMS))
-    lever = so3_hat((pm + left * (vm + 0.5 * left * g))[:, :, 0])
-    swing = so3_hat((vm + left * g)[:, :, 0])
-    out[0:3] = np.sum(lever @ by_gyro + left * by_accel, axis=0)
-    out[3:6] = np.sum(by_gyro, axis=0)
-    out[6:9] = np.sum(swing @ by_gyro + by_accel, axis=0)
+    noise_energy = _LEVER.clear_of_noise * densities[::-1] ** 2 / seconds
+    out = np.empty_like(readings)
+    shrink_to_signal(readings, usual, noise_energy, out)
     return out
 
 
@@ -189,13 +149,4 @@ def _sensor_D_terms(reading: FloatArray, sensor: int) -> FloatArray:
     out = np.zeros((*reading.shape, IMU_TERMS))
     own = np.flatnonzero(sensor == _SENSOR)
     out[..., _ROW[own], own] = reading[..., _COLUMN[own]]
-    return out
-
-
-def _attitudes(R_world_imu: FloatArray, steps: FloatArray) -> FloatArray:
-    """Attitudes (K + 1, 3, 3) from the first one on, turned by each of the steps (K, 3, 3)."""
-    out = np.empty((len(steps) + 1, 3, 3))
-    out[0] = R_world_imu
-    for k, step in enumerate(steps):
-        out[k + 1] = out[k] @ step
     return out

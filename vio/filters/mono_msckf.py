@@ -91,11 +91,11 @@ class MonoMsckf(Msckf):
                 "none leaves it out), "
                 "depth images or a second camera"
             )
-        if settings.calibrate_imu != "off":
+        if settings.calibrate_imu not in ("auto", "off"):
             raise ConfigError(
                 f"msckf.calibrate_imu: {settings.calibrate_imu} needs a stereo pair, as the scale "
                 "of one camera is the "
-                "accelerometer's; set it to off"
+                "accelerometer's; set it to auto"
             )
         return cls(camera, T_cam0_body, settings, imu)
 
@@ -233,8 +233,12 @@ class MonoMsckf(Msckf):
 
 def _for_one_camera(settings: MsckfSettings) -> MsckfSettings:
     clones = max(settings.clones, _MIN_CLONES)
-    # The time offset trades against the scale, which rests on the IMU alone.
+    # Time offset and the accelerometer's scale trade against the scale, which rests on the IMU alone.
     calibrate = "none" if settings.calibrate_camera_imu == "auto" else settings.calibrate_camera_imu
     return replace(
-        settings, max_landmarks=_LANDMARKS, clones=clones, calibrate_camera_imu=calibrate
+        settings,
+        max_landmarks=_LANDMARKS,
+        clones=clones,
+        calibrate_camera_imu=calibrate,
+        calibrate_imu="off",
     )

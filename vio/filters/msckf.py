@@ -108,9 +108,9 @@ class Msckf(Backend):
                 f"msckf.calibrate_camera_imu: {settings.calibrate_camera_imu} needs --motion imu; "
                 "set it to auto or none"
             )
-        if settings.calibrate_imu != "off" and motion != "imu":
+        if settings.calibrate_imu not in ("auto", "off") and motion != "imu":
             raise ConfigError(
-                f"msckf.calibrate_imu: {settings.calibrate_imu} needs --motion imu; set it to off"
+                f"msckf.calibrate_imu: {settings.calibrate_imu} needs --motion imu; set it to auto"
             )
         if camera.is_cylinder:  # equation (R4) is a pinhole's
             settings = replace(settings, calibrate_scale="off")

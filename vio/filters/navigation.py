@@ -22,14 +22,10 @@ from vio.filters import pose_loops as loops
 from vio.filters.imu_gaps import Hidden, ImuHistory
 from vio.filters.imu_start import imu_start
 from vio.filters.imu_terms import (
-    CHOSEN,
+    ENTRIES,
     IMU_TERMS,
-    accel_D_terms,
-    calibrated,
-    gyro_D_terms,
-    raw_rate,
+    chosen_terms,
     significant,
-    term_columns,
     tilt_columns,
     usual_reading,
 )
@@ -46,7 +42,7 @@ from vio.geometry.upright import rotation_to_up
 from vio.imu.faults import ImuSampleCheck, readings_of
 from vio.imu.settings import DEFAULT_IMU, ImuSettings
 from vio.numerics.compiled import move_by_twist
-from vio.records import ImuSample, MotionSample, VelocitySample
+from vio.records import ImuSample, MotionSample, VelocitySample, imu_matrices
 
 DIM = 15  # error dimensions of the navigation state
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
@@ -141,6 +137,7 @@ class Growth:
 
 
 _I3 = np.eye(3)
+_NO_COLUMNS = loops.TermColumns(np.zeros((0, 6)), ENTRIES[:0], np.zeros((DIM, 0)))
 NO_STEP = Growth(np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM)))
 
 
@@ -164,7 +161,8 @@ class ImuMotion:
 
     def __init__(self, settings: MsckfSettings, imu: ImuSettings = DEFAULT_IMU) -> None:
         self._imu = imu
-        self._chosen = CHOSEN[settings.calibrate_imu]  # the IMU's terms that are estimated
+        self._chosen = chosen_terms(settings)  # the IMU's terms that are estimated
+        self._entries = ENTRIES[self._chosen]
         # (6,) mean reading `[gyro, accel]` of the last second; kept where terms are estimated.
         self._usual: FloatArray | None = None
         self._gravity = np.array([0.0, 0.0, -imu.gravity_mps2])
@@ -270,7 +268,6 @@ class ImuMotion:
             EstimationError: there is no sample at all.
         """
         times, raw, hidden = self._interval(start_ns, end_ns)
-        readings = calibrated(raw, nav.imu_terms) if len(self._chosen) else raw
         s = self._imu
         steps = len(times) - 1
         densities = factors * [s.accel_noise_density, s.gyro_noise_density]
@@ -285,18 +282,19 @@ class ImuMotion:
         bias = np.concatenate([nav.gyro_bias, nav.accel_bias])
         noise = loops.ImuNoise(densities, self._walks, variance)
         step = loops.ImuStep(T, v, turned, Phi, Q_parts, Q)
-        loops.integrate(times, readings, bias, self._gravity, noise, step)
+        readings = raw
+        terms = _NO_COLUMNS
+        Phi_imu = None
+        if len(self._chosen):
+            readings = np.empty_like(raw)
+            loops.calibrate(raw, ENTRIES, nav.imu_terms, readings)
+            levers = raw if self._usual is None else significant(raw, self._usual, total, densities)
+            Phi_imu = np.zeros((DIM, len(self._chosen)))
+            terms = loops.TermColumns(levers, self._entries, Phi_imu)
+        loops.integrate(times, readings, bias, self._gravity, noise, terms, step)
         moved = NavState(
             T, v, readings[-1, :3] - nav.gyro_bias, nav.gyro_bias, nav.accel_bias, nav.imu_terms
         )
-        Phi_imu = None
-        if len(self._chosen):
-            own = readings - bias
-            levers = raw if self._usual is None else significant(raw, self._usual, total, densities)
-            by_terms = term_columns(
-                times, levers, own, nav.T_world_imu, nav.velocity, self._gravity
-            )
-            Phi_imu = by_terms[:, self._chosen]
         if hidden is not None and hidden.gap:
             return Transition(moved, Phi, Q, Q_parts, bridged=True, Phi_imu=Phi_imu)
         return Transition(
@@ -316,9 +314,13 @@ class ImuMotion:
         out = np.zeros((3, DIM + len(self._chosen)))
         out[:, 9:12] = -_I3
         if len(self._chosen):
-            out[:, DIM:] = gyro_D_terms(raw_rate(nav.rate + nav.gyro_bias, nav.imu_terms))[
-                :, self._chosen
-            ]
+            out[:, DIM:] = self._rate_D_terms(nav, nav.rate + nav.gyro_bias)
+        return out
+
+    def _rate_D_terms(self, nav: NavState, rate: FloatArray) -> FloatArray:
+        """How a calibrated rate (3,), bias included, moves with the estimated terms (3, I): (A2)."""
+        out = np.empty((3, len(self._entries)))
+        loops.write_terms_of_rate(imu_matrices(nav.imu_terms)[1], rate, self._entries, out)
         return out
 
     def forget_before(self, time_ns: int) -> None:
@@ -355,7 +357,7 @@ class ImuMotion:
         H[:3, 6:9] = np.eye(3)
         H[3:, 9:12] = np.eye(3)
         if len(self._chosen):
-            H[3:, DIM:] = -gyro_D_terms(raw_rate(gyro, nav.imu_terms))[:, self._chosen]
+            H[3:, DIM:] = -self._rate_D_terms(nav, gyro)
         sigmas = np.repeat([ZERO_VELOCITY_SIGMA_MPS, ZERO_RATE_SIGMA_RADPS], 3)
         return Measurement(H, np.concatenate([-nav.velocity, turn]), np.diag(sigmas**2))
 
@@ -406,13 +408,8 @@ class ImuMotion:
         """
         out: FloatArray = velocities.copy()
         loops.move_earlier_velocities(
-            self._gravity, ages_s, np.ascontiguousarray(R_world_imu), error, out
+            self._gravity, ages_s, np.ascontiguousarray(R_world_imu), error, self._entries, out
         )
-        if len(self._chosen):  # the mean force over the time since, times that time
-            force = velocities[-1] - velocities - ages_s[:, None] * self._gravity
-            by_terms = accel_D_terms(np.einsum("nji,nj->ni", R_world_imu, force))[..., self._chosen]
-            by_terms = by_terms @ error[DIM : DIM + len(self._chosen)]
-            out -= np.einsum("nij,nj->ni", R_world_imu, by_terms)
         return out
 
     def rate_variance(self, factors: FloatArray) -> float:

@@ -40,7 +40,9 @@ class _NoiseRules(NamedTuple):
 _NOISE = _NoiseRules()
 _SURPRISING = chi_square_quantile(_NOISE.surprise_probability, np.arange(1, 4)).tolist()
 _EXCEPTIONAL = chi_square_quantile(_NOISE.exception_probability, np.arange(1, 4)).tolist()
-_PARTS = slice(0, 3), slice(3, 6)  # translation, rotation
+ROTATION = slice(3, 6)
+_PARTS = slice(0, 3), ROTATION  # translation, rotation
+SLIGHTLY_INFORMED = _NOISE.doubted_share
 # d E[2 F_k(e^t x) - 1] / dt at t = 0 for x ~ chi-square(k), k = 0..3
 _SENSITIVITY = (0.0, 1 / np.pi, 0.5, 2 / np.pi)
 
@@ -109,6 +111,23 @@ def whitened_correction(
     if math.isnan(found.squared):
         raise np.linalg.LinAlgError("the predicted covariance is not positive")
     return found
+
+
+def turn_shown(step: StepErrors) -> FloatArray:
+    """Return the rotation (3,) by which the images alone contradict a predicted one, from the share
+    of it that a filter which trusts the prediction has corrected.
+
+    With `expected` E and `remaining` R, the gain of a direct measurement of it is (E - R) E^-1;
+    directions that the images hardly inform count as not contradicted.
+    """
+    E = step.expected[ROTATION, ROTATION]
+    L = np.linalg.cholesky(E)
+    whitened = np.linalg.solve(L, np.linalg.solve(L, E - step.remaining[ROTATION, ROTATION]).T)
+    gains, directions = np.linalg.eigh(whitened)
+    shown = directions.T @ np.linalg.solve(L, step.correction[ROTATION])
+    informed = gains > _NOISE.doubted_share
+    shown = np.where(informed, shown / np.maximum(gains, _NOISE.doubted_share), 0.0)
+    return np.asarray(L @ directions @ shown, dtype=np.float64)
 
 
 class MotionNoise:

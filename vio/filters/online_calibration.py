@@ -24,7 +24,7 @@ import numpy as np
 from vio.cameras.rectification_error import TERMS
 from vio.dataclass import dataclass
 from vio.filters import pose_loops as loops
-from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
+from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, chosen_terms, term_sigmas
 from vio.filters.navigation import DIM, Growth, NavState, Transition
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, so3_exp
@@ -309,7 +309,7 @@ class _ImuTermsBlock(CalibrationBlock):
         return motion == "imu" and settings.calibrate_imu != "off"
 
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
-        return term_sigmas()[CHOSEN[settings.calibrate_imu]]
+        return term_sigmas()[chosen_terms(settings)]
 
     def correct(
         self,

@@ -122,17 +122,64 @@ def _cross(a: FloatArray, b: FloatArray, i: int) -> float:
 
 @compiled
 def move_earlier_velocities(
-    gravity: FloatArray, ages: FloatArray, R: FloatArray, error: FloatArray, velocities: FloatArray
+    gravity: FloatArray,
+    ages: FloatArray,
+    R: FloatArray,
+    error: FloatArray,
+    entries: IntArray,
+    velocities: FloatArray,
 ) -> None:
-    """Move velocities (N, 3) of the past by a present error (15,), see
-    `ImuMotion.corrected_earlier`.
+    """Move velocities (N, 3) of the past by a present error (15 + I,), with the entries (I, 3) of
+    the IMU's terms, see `ImuMotion.corrected_earlier`.
     """
     xi = np.empty(velocities.shape)
+    last = velocities[len(ages) - 1]
+    by_terms = np.empty(3)
     for n in range(len(ages)):
         for i in range(3):
             by_bias = R[n, i, 0] * error[12] + R[n, i, 1] * error[13] + R[n, i, 2] * error[14]
             xi[n, i] = error[6 + i] + ages[n] * (by_bias - _cross(gravity, error[3:6], i))
+        if len(entries):
+            by_terms[:] = 0.0
+            for m in range(len(entries)):
+                if entries[m, 0] == 0:
+                    impulse = 0.0  # of the mean force over the time since, along that axis
+                    for i in range(3):
+                        change = last[i] - velocities[n, i] - ages[n] * gravity[i]
+                        impulse += R[n, i, entries[m, 2]] * change
+                    by_terms[entries[m, 1]] += impulse * error[15 + m]
+            for i in range(3):
+                for j in range(3):
+                    xi[n, i] -= R[n, i, j] * by_terms[j]
     move_points(error[3:6], xi, velocities)
+
+
+@compiled
+def write_terms_of_rate(
+    M_gyro: FloatArray, rate: FloatArray, entries: IntArray, out: FloatArray
+) -> None:
+    """Write how a calibrated rate (3,), bias included, moves with the IMU's terms (3, I): (A2), at
+    the reading that `M_gyro` (3, 3) takes to it.
+    """
+    M = M_gyro
+    reading = np.empty(3)
+    scale = 0.0
+    for i in range(3):  # the inverse by the cross products of M's columns
+        j = (i + 1) % 3
+        k = (i + 2) % 3
+        reading[i] = 0.0
+        for r in range(3):
+            s = (r + 1) % 3
+            t = (r + 2) % 3
+            cofactor = M[s, j] * M[t, k] - M[t, j] * M[s, k]
+            reading[i] += cofactor * rate[r]
+            if i == 0:
+                scale += cofactor * M[r, 0]
+    for m in range(len(entries)):
+        for i in range(3):
+            out[i, m] = 0.0
+        if entries[m, 0] == 1:
+            out[entries[m, 1], m] = reading[entries[m, 2]] / scale
 
 
 @compiled
@@ -276,6 +323,14 @@ class ImuNoise(NamedTuple):
     hidden: FloatArray  # (2, K - 1) what gaps hide, variances
 
 
+class TermColumns(NamedTuple):
+    """How errors of an IMU's scales and misalignments move the state over an integration: (A3)."""
+
+    levers: FloatArray  # (K, 6) readings `[gyro, accel]` as the terms multiply them
+    entries: IntArray  # (I, 3) of each term: sensor (0 accelerometer, 1 gyro), row, column
+    columns: FloatArray  # (15, I) added to
+
+
 class ImuStep(NamedTuple):
     """What an integration moves and writes."""
 
@@ -341,12 +396,58 @@ def _add_noise(
 
 
 @compiled
+def _add_terms(
+    R: FloatArray,
+    new: FloatArray,
+    p: FloatArray,
+    v: FloatArray,
+    gravity: FloatArray,
+    span: tuple[float, float],
+    levers: FloatArray,
+    entries: IntArray,
+    columns: FloatArray,
+) -> None:
+    """Add what one step brings to the columns (15, I) of the IMU's terms: (A3).
+
+    Attitudes before and after it, position and velocity in its middle, `span` as in `_add_noise`,
+    and the levers (2, 6) at both ends.
+    """
+    dt, left = span
+    by = np.empty(3)
+    lever = np.empty(3)
+    swing = np.empty(3)
+    for i in range(3):
+        swing[i] = v[i] + left * gravity[i]
+        lever[i] = p[i] + left * (v[i] + 0.5 * left * gravity[i])
+    for n in range(len(entries)):
+        row = entries[n, 1]
+        if entries[n, 0] == 0:
+            before = levers[0, 3 + entries[n, 2]]
+            after = levers[1, 3 + entries[n, 2]]
+            for i in range(3):
+                by[i] = 0.5 * (R[i, row] * before + new[i, row] * after) * dt
+                columns[i, n] += left * by[i]
+                columns[6 + i, n] += by[i]
+        else:
+            mean = 0.5 * (levers[0, entries[n, 2]] + levers[1, entries[n, 2]])
+            for i in range(3):
+                by[i] = 0.5 * (R[i, row] + new[i, row]) * mean * dt
+            for i in range(3):
+                j = (i + 1) % 3
+                k = (i + 2) % 3
+                columns[i, n] += lever[j] * by[k] - lever[k] * by[j]
+                columns[3 + i, n] += by[i]
+                columns[6 + i, n] += swing[j] * by[k] - swing[k] * by[j]
+
+
+@compiled
 def integrate(
     times_ns: FloatArray,
     readings: FloatArray,
     bias: FloatArray,
     gravity: FloatArray,
     noise: ImuNoise,
+    terms: TermColumns,
     out: ImuStep,
 ) -> None:
     """Integrate readings (K, 6) `[gyro, accel]` at times (K,), equations (N1) to (N4)."""
@@ -381,6 +482,18 @@ def integrate(
         accel2 = densities[0] ** 2 * dt + noise.hidden[0, k]
         gyro2 = densities[1] ** 2 * dt + noise.hidden[1, k]
         _add_noise(R, pm, vm, gravity, (dt, left), (accel2, gyro2), out)
+        if len(terms.entries):
+            _add_terms(
+                R,
+                new,
+                pm,
+                vm,
+                gravity,
+                (dt, left),
+                terms.levers[k : k + 2],
+                terms.entries,
+                terms.columns,
+            )
         for i in range(3):
             for j in range(3):
                 R[i, j] = new[i, j]
@@ -429,6 +542,43 @@ def _finish_growth(total: float, gravity: FloatArray, walks: FloatArray, out: Im
         Phi[6 + i, 3 + k] = total * gravity[j]
         Q[9 + i, 9 + i] = walks[0] ** 2 * total
         Q[12 + i, 12 + i] = walks[1] ** 2 * total
+
+
+@compiled
+def calibrate(raw: FloatArray, entries: IntArray, terms: FloatArray, out: FloatArray) -> None:
+    """Write readings (K, 6) `[gyro, accel]` with scale and misalignment taken out: (A1), of terms
+    (I,) and their entries (I, 3).
+    """
+    for k in range(len(raw)):
+        for i in range(6):
+            out[k, i] = raw[k, i]
+        for n in range(len(entries)):
+            first = 3 - 3 * entries[n, 0]
+            out[k, first + entries[n, 1]] += terms[n] * raw[k, first + entries[n, 2]]
+
+
+@compiled
+def shrink_to_signal(
+    raw: FloatArray, usual: FloatArray, noise_energy: FloatArray, out: FloatArray
+) -> None:
+    """Write readings (K, 6) `[gyro, accel]`, their deviation from the usual one (6,) shrunk by
+    their noise: (A5).
+
+    `noise_energy` (2,): of the mean deviation of gyro and accelerometer, below which nothing is
+    left.
+    """
+    n = len(raw)
+    for part in range(2):
+        squared = 0.0
+        for i in range(3 * part, 3 * part + 3):
+            mean = 0.0
+            for k in range(n):
+                mean += raw[k, i] - usual[i]
+            squared += (mean / n) ** 2
+        kept = np.sqrt(max(1.0 - noise_energy[part] / max(squared, 1e-300), 0.0))
+        for k in range(n):
+            for i in range(3 * part, 3 * part + 3):
+                out[k, i] = usual[i] + kept * (raw[k, i] - usual[i])
 
 
 @compiled

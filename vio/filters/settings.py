@@ -135,10 +135,11 @@ class MsckfSettings(Section):
         "what is estimated besides the motion: T_cam0_imu (extrinsics), the time offset, or both; "
         "auto: the time offset, where a stereo pair has an IMU",
     )
-    calibrate_imu: Literal["off", "scale", "full"] = setting(
-        "off",
+    calibrate_imu: Literal["auto", "off", "scale", "full"] = setting(
+        "auto",
         "what is estimated of the IMU besides the biases: nothing; scales; or scales, misalignment "
-        "and the gyro's rotation against the accelerometer",
+        "and the gyro's rotation against the accelerometer; auto: full, where a stereo pair has an "
+        "IMU, or scale, where extrinsics are estimated",
     )
     calibrate_stereo: Literal["on", "off"] = setting(
         "on",
