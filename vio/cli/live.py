@@ -84,8 +84,11 @@ def execute(args: argparse.Namespace) -> int:
     try:
         rig = None
         if args.calibration is not None:
-            cameras = 1 if args.layout == "single" else 2
-            rig = load_rig(args.calibration, image_size=source.image_size, cameras=cameras)
+            rig = load_rig(
+                args.calibration,
+                image_size=source.image_size,
+                cameras=1 if args.layout == "single" else 2,
+            )
     except VioError:
         source.close()
         raise
