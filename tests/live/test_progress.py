@@ -10,6 +10,7 @@ import pytest
 from vio.cli import waiting
 from vio.cli.output import ProgressBar
 from vio.errors import NOTE
+from vio.view import stream
 
 
 class Terminal(io.StringIO):
@@ -86,3 +87,15 @@ def test_draws_nothing_where_stderr_is_no_terminal(capsys: pytest.CaptureFixture
         bar.update(2, 9)
         bar.advance()
     assert capsys.readouterr() == ("", "")
+
+
+def test_the_address_of_a_page_is_no_warning(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def interrupted(seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stream.time, "sleep", interrupted)
+    with caplog.at_level(NOTE):
+        stream.wait_for_interrupt("http://127.0.0.1:9090")
+    assert [record.levelno for record in caplog.records] == [NOTE]
