@@ -4,7 +4,7 @@
 # With `--pairs_from_reference` all have 0.30 m.
 # Guessed: pairs are 10 m of the ground truth apart, as in KITTI's measure and in `vio eval`; noise makes an error larger.
 # Matters here: of two systems the one with the noisier output looks better, the more so the slower the rig and the higher the rate.
-# Smoothing a trajectory makes it worse.
+# Taking the noise out makes it worse.
 # Source: `evo_rpe tum --help` ("determine the pose pairs from the reference trajectory"); this run.
 set -euo pipefail
 folder=$(mktemp -d)

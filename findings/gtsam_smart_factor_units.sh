@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # gtsam 4.3.0: a smart projection factor judges by a tolerance of 1, in the unit of the calibration, whether its point can be triangulated.
-# With pixels that holds nearly always. In normalised coordinates (a focal length of 1, sigma scaled alike) it takes points 3 to 6 m away, seen along
+# With pixels that is small. In normalised coordinates (a focal length of 1, sigma scaled alike) it takes points 3 to 6 m away, seen along
 # a path of 1.5 m, for points at infinity: their error is 0, and the parallax is put into rotation. From exact poses and exact
 # measurements ISAM2 and Gauss-Newton turn the cameras by 6, 13 and 19 degrees; Levenberg-Marquardt ends at once, as the error is 0.
 # Guessed: units cancel once the noise has the same unit.

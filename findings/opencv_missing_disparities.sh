@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # OpenCV 4.14.0 and 5.0.0: `reprojectImageTo3D(..., handleMissingValues=True)` takes the smallest disparity *of the image* for "missing".
-# Where every pixel has a disparity, the farthest surface is deleted (z = 10000). Where holes are NaN or 0 beside negative values, they are not found.
+# Where every pixel has a disparity, the farthest surface is deleted (z = 10000). Holes of NaN are not found, and a surface is deleted beside them.
 # And StereoSGBM with a `minDisparity` above 1 marks holes by a positive disparity, which without the flag is a surface.
 # Guessed: missing is what the matchers mark as missing, (minDisparity - 1), or what is not positive.
-# Matters here: disparities of networks, of renders and of our depth images are dense, or have holes of 0 or NaN: a wall at the end of a room
-# is gone from the cloud, while the holes stay. Masks of one's own (disparity > 0) do what is meant.
+# Matters here: disparities of networks, of renders and of depth images are dense, or have holes of NaN: a wall at the end of a room
+# is gone from the cloud. Masks of one's own (disparity > 0) do what is meant.
 # Source: docs.opencv.org, reprojectImageTo3D ("pixels with the minimal disparity"); this run.
 set -euo pipefail
 folder=$(mktemp -d)

@@ -4,7 +4,7 @@
 # Guessed: an error of the order of rounding, as in the other direction, where 1e-8 rad come out exactly.
 # Matters here: increments of an IMU, biases (1e-3 rad/s at 200 Hz are 5e-6 rad), corrections of an optimiser and derivatives by steps of 1e-6
 # go through it in Python. The pose stands still, or an iteration has "converged". SciPy's `Rotation` and ours keep them.
-# Source: docs.opencv.org, Rodrigues, which states no limit; this run.
+# Source: docs.opencv.org, Rodrigues; this run.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # pymavlink 2.4.50: unless MAVLINK20 is set in the environment before it is imported, `mavutil` speaks MAVLink 1. There a vision position has no
 # covariance: the covariance that is given after the yaw is taken for the argument `force_mavlink1` and is not sent, without a word. ODOMETRY does not exist.
-# Guessed: MAVLink 2, which autopilots speak since 2017; or an error for an argument that the message does not have.
+# Guessed: MAVLink 2, the present protocol; or an error for an argument that the message does not have.
 # Matters here: poses of a visual-inertial system that a script sends on arrive without covariance, and the autopilot uses its own constant noise.
 # `pymavlink.dialects.v20.common`, which `vio live --mavlink` imports, does not ask the environment.
 # Source: https://mavlink.io/en/mavgen_python/ (MAVLINK20); this run.
