@@ -24,6 +24,7 @@ from vio.config import BASIC, Config, describe
 from vio.errors import NOTE, DataError
 from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import se3_inverse
+from vio.mavlink.link import open_link
 
 FRAMES = 24
 CONTRACT = (
@@ -830,7 +831,10 @@ def test_the_help_of_a_main_command_ends_with_three_examples(name: str) -> None:
     found = re.findall(rf"^  (vio {name} .*)\n      \S", text, re.MULTILINE)
     assert len(found) == 3
     for line in found:
-        assert parser.parse_args(shlex.split(line)[1:]).command == name
+        parsed = parser.parse_args(shlex.split(line)[1:])
+        assert parsed.command == name
+        if getattr(parsed, "mavlink", None) is not None:
+            open_link(parsed.mavlink).close()
 
 
 def test_the_help_of_run_names_every_kind_of_recording() -> None:

@@ -233,6 +233,7 @@ def test_a_path_with_a_colon_is_a_path_when_it_exists(
     [
         ("nowhere", "nowhere does not exist; check the path"),
         ("no/where", "no/where does not exist, nor does no; check"),
+        ("demo/street", "demo/street does not exist; 'vio demo' renders it"),
         ("empti", "empti does not exist; did you mean empty"),
         (
             "holiday",

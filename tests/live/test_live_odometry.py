@@ -377,6 +377,9 @@ def test_a_slow_computer_is_named_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (found.results, found.waiting) == (40, 2)
     assert found.latency_median_ms == pytest.approx(800)
     assert found.latency_worst_ms == pytest.approx(800)
+    assert str(found) == (
+        "40 frames with a pose, 0 left out; latency 800 ms (median), 800 (95 %), 800 (worst)"
+    )
     quiet, full = LiveMonitor(judges_latency=False), LiveMonitor(judges_latency=True)
     assert full.figures(0).latency_worst_ms is None
     for k in range(12):

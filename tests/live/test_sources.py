@@ -27,6 +27,7 @@ from tests.same_events import frames_of
 from vio.cameras.rig import Rig
 from vio.cli import main
 from vio.config import Config
+from vio.datasets.kitti import write_calibration
 from vio.datasets.rigs import load_rig
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.settings import DatasetSettings
@@ -39,7 +40,13 @@ from vio.sources.oak import OakSource
 from vio.sources.realsense import RealSenseSource
 from vio.sources.recorder import Form, Recorder
 from vio.sources.run import LiveOptions, run_source
-from vio.sources.source import ImuInterpolation, SourceEvent, SourceFrame, open_source
+from vio.sources.source import (
+    ImuInterpolation,
+    Layout,
+    SourceEvent,
+    SourceFrame,
+    open_source,
+)
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +103,7 @@ class Replayed:
     """A camera with an IMU, made of a recording's events."""
 
     has_imu = True
+    image_size = None
 
     def __init__(self, flight: Path, stop_after: int | None = None) -> None:
         self._dataset, self.rig = vio.open_dataset(flight), load_rig(flight)
@@ -249,6 +257,29 @@ def test_without_the_extra_it_is_named(
         MissingDependencyError, match=rf"extra {extra}: .* '\.\[{extra}\]' in a clone"
     ):
         open_source(name)
+
+
+@pytest.mark.parametrize(
+    ("layout", "size"),
+    [("side-by-side", (160, 90)), ("top-bottom", (320, 45)), ("single", (320, 90))],
+)
+def test_a_video_states_the_size_of_its_images(
+    video: Path, layout: Layout, size: tuple[int, int]
+) -> None:
+    source = open_source(f"video:{video}", layout)
+    frame = next(event for event in source.events() if event is not None)
+    source.close()
+    assert isinstance(frame, SourceFrame)
+    assert source.image_size == size == frame.left.shape[::-1]
+
+
+def test_the_source_states_the_size_that_a_calibration_lacks(
+    video: Path, flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_calibration(tmp_path, vio.open_dataset(flight).recording.camera, None)  # KITTI's
+    options = ["--calibration", str(tmp_path / "calib.txt"), "--drop", "none"]
+    assert main(["live", f"video:{video}", *options]) == 0
+    assert "16 frames with a pose, 0 left out; latency" in capsys.readouterr().out
 
 
 def test_what_a_run_needs_is_named(

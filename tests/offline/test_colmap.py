@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -658,3 +660,14 @@ def test_a_path_is_broken_where_a_motion_is_off_by_more_than_its_length(
     other[12:, 0, 3] += off_m
     piece, pieces = _longest_piece(own, other, np.ones(19, dtype=np.bool_))
     assert (int(piece.sum()), pieces) == (kept, 1)
+
+
+def test_importing_colmap_leaves_the_handlers_of_signals() -> None:
+    """The package's own import takes SIGTERM, and a command would leave unfinished files."""
+    code = (
+        "import os, signal, sys\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(3))\n"
+        "import vio.offline.colmap\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 3

@@ -49,6 +49,7 @@ class FakeSource:
     frames: list[SourceFrame]
     has_imu: bool = False
     rig: Rig | None = None
+    image_size: tuple[int, int] | None = None
     given: int = 0
     closed: bool = False
     pause_s: float = 0.0  # between frames

@@ -134,6 +134,16 @@ def test_names_what_is_wrong_with_a_description(
     assert "\n" not in str(caught.value)
 
 
+def test_a_side_in_no_unit_is_asked_for(tmp_path: Path) -> None:
+    """BoofCV's own examples have 1, which made a pair's baseline 33 times as long."""
+    file = tmp_path / "target.yaml"
+    text, expected = DESCRIPTIONS["boofcv"]
+    file.write_text(text.replace("0.03", "1.0"))
+    with pytest.raises(CalibrationError, match=r"shapeSize is 1, .* measure a square .*--size"):
+        read_target(file)
+    assert read_target(file, size_m=0.03) == expected
+
+
 def test_the_page_has_the_size_of_the_board_and_a_ruler() -> None:
     page = page_of(GRID)
     width = 1e3 * (6 * GRID.pitch_m + GRID.pitch_m - GRID.size_m)

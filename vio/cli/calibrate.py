@@ -89,7 +89,12 @@ def execute(args: argparse.Namespace) -> int:
     check_writable(out)
     with one_blas_thread(), ProgressBar(f"calibrate {source.path.name}") as bar:
         report = measure(
-            source, _frontend, pairs=args.pairs, frames=args.frames, progress=bar.update
+            source,
+            _frontend,
+            pairs=args.pairs,
+            frames=args.frames,
+            begin=lambda part: bar.begin(f"calibrate {source.path.name}: {part}"),
+            progress=bar.update,
         )
     facts = {"out": str(out), **_facts(report)}
     with atomic_folder(out, replace=True, marker=MARKER) as folder:

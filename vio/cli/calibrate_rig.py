@@ -106,11 +106,12 @@ def execute(args: argparse.Namespace) -> int:
     with one_blas_thread(), ProgressBar("look for the board", unit="frames") as bar:
         filmed = film(raw, CornerDetector(target), max_frames=args.frames, progress=bar.update)
         lens = None if args.lens == _AUTO else args.lens
-        found = calibrate_cameras(filmed, target, lens)
+        found = calibrate_cameras(filmed, target, lens, bar.begin)
         rig = found.rig
         inertial = None
         if filmed.imu is not None and not args.no_imu:
             densities = _densities(args.imu_noise)
+            bar.begin("adjust the IMU")
             try:
                 inertial = calibrate_with_imu(filmed, target, found, densities, args.imu_terms)
             except DataError as error:

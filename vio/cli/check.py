@@ -81,7 +81,7 @@ def execute(args: argparse.Namespace) -> int:
             folder,
             mappers,
             CheckOptions(args.keyframes, args.source, args.threads),
-            progress=bar.update,
+            begin=lambda step: bar.begin(f"check {args.run.name}: {step}"),
             announce=lambda text: print(text, file=sys.stderr),
         )
         report = {

@@ -74,6 +74,7 @@ def execute(args: argparse.Namespace) -> int:
             pairs=args.pairs,
             tracked=args.frames,
             span=span,
+            begin=lambda part: bar.begin(f"inspect {recording.path.name}: {part}"),
             progress=bar.update,
         )
     facts = {"source": str(recording.path), "kind": recording.kind, **_facts(report)}

@@ -19,6 +19,7 @@ from vio.cli.arguments import (
     mavlink_from,
 )
 from vio.cli.stopping import StopRequest
+from vio.errors import VioError
 
 
 def add_parser(commands: Any) -> None:
@@ -31,7 +32,7 @@ def add_parser(commands: Any) -> None:
         **examples(
             "vio live realsense: --view  # with the device's own calibration",
             "vio live v4l2:/dev/video0 --calibration rig.yaml --record kept  # a webcam pair",
-            "vio live oak: --mavlink udpout:192.168.1.10:14550  # poses to an autopilot",
+            "vio live oak: --mavlink udp:192.168.1.10:14550  # poses to an autopilot",
         ),
     )
     parser.add_argument("source", metavar="SOURCE", help="the camera")
@@ -79,9 +80,18 @@ def execute(args: argparse.Namespace) -> int:
     map_use = map_from(args)
     mavlink = mavlink_from(args)
     kept = kept_from(args, args.source)
-    rig = None
-    if args.calibration is not None:
-        rig = load_rig(args.calibration, cameras=1 if args.layout == "single" else 2)
+    source = open_source(args.source, args.layout)
+    try:
+        rig = None
+        if args.calibration is not None:
+            rig = load_rig(
+                args.calibration,
+                image_size=source.image_size,
+                cameras=1 if args.layout == "single" else 2,
+            )
+    except VioError:
+        source.close()
+        raise
     viewers: list[Any] = []
 
     outputs = contextlib.ExitStack()
@@ -107,7 +117,7 @@ def execute(args: argparse.Namespace) -> int:
 
     with outputs, StopRequest() as asked:
         run = run_source(
-            open_source(args.source, args.layout),
+            source,
             config,
             rig,
             LiveOptions(kept, args.record, args.record_as, map_use, args.drop),
@@ -117,14 +127,9 @@ def execute(args: argparse.Namespace) -> int:
         )
     for viewer in viewers:
         viewer.close()
-    found = run.figures
-    print(
-        f"{found.results} frames with a pose, {found.dropped} left out, {run.samples} IMU samples"
-    )
-    if found.latency_median_ms is not None:
-        print(
-            f"latency {found.latency_median_ms:.0f} ms (median), {found.latency_95_ms:.0f} (95 %)"
-        )
+    print(run.figures)
+    if run.samples:
+        print(f"{run.samples} IMU samples")
     return 0
 
 

@@ -118,7 +118,10 @@ def execute(args: argparse.Namespace) -> int:
         "extract": lambda: files.extract_map(args.map, args.out, args.around, args.radius),
     }
     facts = actions[args.action]()
-    return print_result(facts, _rows(facts), as_json=args.json)
+    rows = _rows(facts)
+    if args.action == "check":
+        rows.append(("checked", "every row agrees with its checksum"))
+    return print_result(facts, rows, as_json=args.json)
 
 
 def _merge(args: argparse.Namespace) -> dict[str, Any]:

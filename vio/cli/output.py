@@ -79,6 +79,16 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
         self._total = self._total if total is None else total
         self._advance_to(done)
 
+    def begin(self, part: str) -> None:
+        """Go on with another part of the work, whose steps are not known yet."""
+        self._label = part
+        self._done = 0
+        self._total = None
+        if self._bar is not None:
+            self._bar.reset()
+            self._bar.total = None
+            self._bar.set_description(part)
+
     def advance(self) -> None:
         """Advance by one step."""
         if self._bar is not None:
@@ -98,6 +108,8 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
         """Return how far the work is; None: the bar shows it."""
         if self._bar is not None:
             return None
+        if not self._done and self._total is None:
+            return self._label
         of = "" if self._total is None else f" of {self._total}"
         return f"{self._label}: {self._done}{of} {self._unit}"
 

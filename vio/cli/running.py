@@ -498,7 +498,7 @@ def _open_view(
     )
     stream, address = open_stream(where, recording.path.name)
     if address is not None:
-        log.warning("the run is shown at %s", address)
+        log.log(NOTE, "the run is shown at %s", address)
     return RerunViewer(stream, rig, address=address)
 
 

@@ -35,6 +35,7 @@ MODULES = [
 _FILES = (".npz", ".mat", ".bag", ".db3", ".mcap")  # recordings that are one file
 _MAX_LOOKED_AT = 200  # of what a folder holds that is no recording itself
 _MAX_NAMED = 3  # of the recordings in it
+_DEMO = Path("demo/street")  # that the documentation's examples read
 
 
 def readers() -> dict[str, Reader]:
@@ -164,6 +165,8 @@ def _detect(path: Path) -> str:
 def _missing(path: Path) -> str:
     """Say that a path does not exist, and from where on it is wrong."""
     folder = path.parent
+    if path == _DEMO:
+        return f"{path} does not exist; 'vio demo' renders it"
     if not folder.is_dir():
         return f"{path} does not exist, nor does {folder}; check the path"
     near = difflib.get_close_matches(

@@ -64,9 +64,12 @@ def inspect_recording(
     pairs: int = PAIRS,
     tracked: int = TRACKED,
     span: tuple[int, int | None] = (0, None),
+    begin: Callable[[str], None] = lambda part: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Inspection:
     """Examine a recording, or its frames from the first of `span` to before the second.
+
+    `begin` is called with the part that comes next, `progress` with how far it is.
 
     Raises:
         DataError: an image has a wrong size, or too many cannot be read.
@@ -77,15 +80,19 @@ def inspect_recording(
     parts = [frames_part(times_ns), camera_part(recording)]
     off: StereoError | None = None  # the calibration
     if recording.has_images and frames_seen:
+        begin("read images")
         frames = _spread(dataset, frames_seen, pairs, progress)
         parts.append(images_part(frames))
         if recording.camera.kind == "rgbd":
             parts.append(depths_part(frames))
         elif recording.camera.kind == "stereo":
+            begin("match left and right")
             stereo, off = rows_part(frames, pair_as_read(dataset), progress)
+            begin("look at the pairing")
             parts += [stereo, *_pairs_parts(dataset, frames_seen)]
     parts += _motion_parts(dataset, span, times_ns)
     if recording.has_images and tracked > 1 and frames_seen:
+        begin("track features")
         tracked = _frames_to_track(recording, times_ns, tracked)
         seen = _track(dataset, build_frontend(dataset), frames_seen[:tracked], progress)
         parts += _tracking_parts(recording, seen)

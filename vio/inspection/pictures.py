@@ -177,7 +177,7 @@ def rows_part(
     for done, f in enumerate(frames):
         if f.left is not None and f.right is not None:
             matches.append(sift_pairs(f.left, f.right))
-        progress(len(frames) + done + 1, 2 * len(frames))  # they were read before
+        progress(done + 1, len(frames))
     counts = list(map(len, matches))
     z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _PICTURES.min_matches)])
     found = row_residuals(z, *_size_of_images(frames))

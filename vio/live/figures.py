@@ -42,6 +42,17 @@ class LiveFigures:
     latency_95_ms: float | None
     latency_worst_ms: float | None  # of all results
 
+    def __str__(self) -> str:
+        """Say it in words."""
+        refused = f", {self.refused} calls refused" if self.refused else ""
+        text = f"{self.results} frames with a pose, {self.dropped} left out{refused}"
+        if self.latency_median_ms is None:
+            return text
+        return (
+            f"{text}; latency {self.latency_median_ms:.0f} ms (median), "
+            f"{self.latency_95_ms:.0f} (95 %), {self.latency_worst_ms:.0f} (worst)"
+        )
+
 
 class LiveMonitor:
     """Measures latency and counts frames that are left out.

@@ -101,10 +101,11 @@ def drop_session(path: Path, session: int) -> dict[str, Any]:
         DataError: there is no such session, it is the only one, or the file cannot be used.
     """
     sessions, owner, _ = _outline(path)
+    if not 0 <= session < len(sessions):
+        numbers = f"0 to {len(sessions) - 1}" if len(sessions) > 1 else "0 alone"
+        raise DataError(f"{path}: has no session {session}, but {numbers}")
     if len(sessions) == 1:
         raise DataError(f"{path}: has session 0 alone, and no map is left without it")
-    if not 0 <= session < len(sessions):
-        raise DataError(f"{path}: has no session {session}, but 0 to {len(sessions) - 1}")
     return _keep(path, path, owner != session)
 
 

@@ -200,6 +200,7 @@ def measure(
     *,
     pairs: int,
     frames: int,
+    begin: Callable[[str], None],
     progress: Callable[[int, int], None],
 ) -> CalibrationReport:
     """Measure a recording's calibration: first left and right, which everything else depends on.
@@ -209,7 +210,8 @@ def measure(
         build_frontend: makes the front end that tracks its images.
         pairs: stereo pairs to match.
         frames: frames to track for the motion sensor.
-        progress: called with (done, total) of the part at work.
+        begin: called with the part that comes next.
+        progress: called with (done, total) of the part at work, where that is known.
 
     Raises:
         VioError: the recording cannot be read.
@@ -217,10 +219,12 @@ def measure(
     notes = _notes(source)
     tracked = None
     if source.raw_pairs:
+        begin("match left and right")
         matches = _match_images(source, pairs, progress)
     else:
         assert source.dataset is not None
-        tracked = track(source.dataset, build_frontend, frames)
+        begin("track features")
+        tracked = track(source.dataset, build_frontend, frames, progress)
         matches = _match_tracks(source.dataset.recording, tracked[0], pairs)
     given = source.T_cam0_cam1
     stereo, agreeing = _measure_stereo(matches.rays)
@@ -234,7 +238,9 @@ def measure(
     if again := _again(source, stereo, findings):
         # features are tracked along rows that agree; what the given calibration is off by, is told
         # by the matches that need no rows
-        report = measure(again, build_frontend, pairs=pairs, frames=frames, progress=progress)
+        report = measure(
+            again, build_frontend, pairs=pairs, frames=frames, begin=begin, progress=progress
+        )
         if report.in_motion is not None and isinstance(report.stereo, StereoEstimate):
             findings = judge_stereo(report.stereo, given, agreeing)
         return replace(
@@ -249,14 +255,19 @@ def measure(
         why = f"{fault}: correct that first, then measure again"
         return CalibrationReport(source, stereo, described, _no_imu(why), findings, notes)
     recording = source.dataset.recording
-    tracks, samples = tracked or track(source.dataset, build_frontend, frames, progress)
+    if tracked is None:
+        begin("track features")
+        tracked = track(source.dataset, build_frontend, frames, progress)
+    tracks, samples = tracked
     in_motion: SelfCalibration | None = None
     intrinsics: Intrinsics | NotObservable = NotObservable(
         _INTRINSICS, "left and right could not be measured"
     )
     if isinstance(stereo, StereoEstimate):
+        begin("adjust left and right in motion")
         stereo, intrinsics, in_motion = _measure_in_motion(source, stereo, tracks)
         findings = (*judge_stereo(stereo, given, agreeing), *judge_intrinsics(intrinsics))
+    begin("adjust the motion sensor")
     motion = camera_motion(recording.camera, tracks, recording.frame_times_ns)
     imu = _measure_imu(recording, tracks, samples, motion)
     return CalibrationReport(source, stereo, described, imu, findings, notes, intrinsics, in_motion)

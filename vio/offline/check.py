@@ -64,7 +64,7 @@ def check_run(
     mappers: Sequence[Mapper],
     options: CheckOptions,
     *,
-    progress: Callable[[int, int], None],
+    begin: Callable[[str], None],
     announce: Callable[[str], None] = log.info,
 ) -> tuple[MapperResult, ...]:
     """Reconstruct keyframes of a run from their images with a known stereo rig, and compare.
@@ -79,7 +79,7 @@ def check_run(
         folder: an existing, empty folder.
         mappers: COLMAP's.
         options: how much, by what.
-        progress: called with (done, total).
+        begin: called with the step that comes next.
         announce: called with the number of keyframes and the time that they take.
 
     Raises:
@@ -93,13 +93,14 @@ def check_run(
     database = folder / "database.db"
     minutes = expected_minutes(len(keyframes), mappers)
     announce(f"{len(keyframes)} keyframes: about {minutes:.2g} minutes on one slow core")
+    begin(f"write images, step 1 of {steps}")
     write_images(run, options.source, keyframes, names, images)
-    progress(1, steps)
     loops = loop_pairs(path.loops, path.frames[keyframes])
+    begin(f"match images, step 2 of {steps}")
     match_images(database, images, names, path.camera, loops, threads=options.threads)
-    progress(2, steps)
     results: list[MapperResult] = []
-    for mapper in mappers:
+    for step, mapper in enumerate(mappers, start=3):
+        begin(f"{mapper} mapper, step {step} of {steps}")
         model = reconstruct(
             database, images, names, mapper, folder / mapper, loops, threads=options.threads
         )
@@ -111,7 +112,6 @@ def check_run(
                 compare_keyframes(path, rows, model.T_world_cam0, run.truth, linked=model.linked),
             )
         results.append(MapperResult(mapper, len(keyframes), found))
-        progress(2 + len(results), steps)
     write_picture(folder / "check.png", lambda: draw_check(path.trajectory, results))
     shutil.rmtree(images)
     database.unlink()

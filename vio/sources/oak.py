@@ -47,6 +47,8 @@ class OakSource:
     Stamps are those of the device's exposures.
     """
 
+    image_size: tuple[int, int] | None = (_STREAMS.width, _STREAMS.height)
+
     def __init__(self, name: str) -> None:
         """Open the device and start it.
 

@@ -56,6 +56,8 @@ class RealSenseSource:
     `LiveSource`.
     """
 
+    image_size: tuple[int, int] | None = (_STREAMS.width, _STREAMS.height)
+
     def __init__(self, name: str) -> None:
         """Open the device and start it, with the infrared projector off.
 

@@ -38,6 +38,7 @@ class LiveSource(Protocol):
     # the calibration that the device has stored; None: it has none, and the user gives one
     rig: Rig | None
     has_imu: bool  # whether samples come
+    image_size: tuple[int, int] | None  # width and height of one image; None: not known yet
 
     def events(self) -> Iterator[SourceEvent | None]:
         """Yield frames and samples as they come, each kind in order of time; None at least each

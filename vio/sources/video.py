@@ -52,6 +52,17 @@ class VideoSource:
             raise DataError(
                 f"{name}: OpenCV cannot open it; check the name, and that no other program uses it"
             )
+        self.image_size = self._size_of_a_half()
+
+    def _size_of_a_half(self) -> tuple[int, int] | None:
+        """Return width and height of one image as the video states them; None: it does not."""
+        width = round(self._video.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = round(self._video.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if self._layout == "side-by-side":
+            width //= 2
+        if self._layout == "top-bottom":
+            height //= 2
+        return (width, height) if width > 0 and height > 0 else None
 
     def events(self) -> Iterator[SourceEvent | None]:
         """Yield frames until the file ends.

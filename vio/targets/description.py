@@ -451,7 +451,16 @@ class _Entries:
         return Target("charuco", height, width, side, ratio, name)
 
     def boofcv(self) -> Target:
-        """Read BoofCV's checkerboard, which counts squares and knows no unit."""
+        """Read BoofCV's checkerboard, which counts squares and knows no unit.
+
+        Raises:
+            CalibrationError: a square has the side 1, which is the unit and no length.
+        """
+        if self.side("shapeSize") == 1:
+            raise CalibrationError(
+                f"{self.path}: shapeSize is 1, and BoofCV states no unit; measure a square and give "
+                "its side in metres (--size)"
+            )
         return Target(
             "checkerboard", self.count("numRows"), self.count("numCols"), self.side("shapeSize")
         )

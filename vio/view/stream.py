@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
-from vio.errors import ConfigError, DataError, extra_text
+from vio.errors import NOTE, ConfigError, DataError, extra_text
 from vio.numerics.kinds import Capacity
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def _is_replaceable(path: Path) -> bool:
 
 def wait_for_interrupt(address: str) -> None:
     """Serve the page until Ctrl-C."""
-    log.warning("shown at %s; Ctrl-C ends the server", address)
+    log.log(NOTE, "shown at %s; Ctrl-C ends the server", address)
     with contextlib.suppress(KeyboardInterrupt):
         while True:
             time.sleep(3600)

@@ -8,6 +8,9 @@ world to the camera (`cam_from_world`, our `T_cam_world`), ours are the inverse.
 
 from __future__ import annotations
 
+import signal
+import threading
+
 from vio.errors import MissingDependencyError
 
 try:
@@ -18,6 +21,10 @@ except ImportError as _error:
         "14 on ARM; "
         "install it with: pip install 'pycolmap>=4.2'"
     ) from _error
+
+if threading.current_thread() is threading.main_thread():
+    # its import takes SIGTERM away from Python, and ends the process with a stack trace at once
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
 
 SEED = 0
 SIFT_FEATURES = 1500  # per image
