@@ -19,6 +19,8 @@ import yaml
 from vio.cameras.rig import Rig
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.plausible import checked_rig
+from vio.datasets.rigs.source import check_direction
+from vio.datasets.sides import first_pair, pairs_of
 from vio.datasets.yaml_files import (
     Entries,
     imu_densities,
@@ -44,8 +46,11 @@ def is_camchain(entries: Entries) -> bool:
     return all(isinstance(camera, dict) and "intrinsics" in camera for camera in cameras)
 
 
-def read_camchain(path: Path) -> Rig:
+def read_camchain(path: Path, *, alone: bool = False) -> Rig:
     """Read a camchain of one camera or two and, beside it, the IMU's file.
+
+    Of two cameras that were calibrated with the IMU one by one, each file has one (`cam0-imu.yaml`
+    and `cam1-imu.yaml`): they are a pair, unless the camera is asked for alone.
 
     A depth camera's `depth_factor`, levels per metre, is no entry of Kalibr's and may be added to
     cam0.
@@ -59,13 +64,19 @@ def read_camchain(path: Path) -> Rig:
         raise CalibrationError(
             f"{path}: is no camchain of Kalibr; it must hold the block cam0 and, for stereo, cam1"
         )
+    notes: list[str] = []
+    if not alone and (files := _one_file_each(path)) is not None:
+        path = files[0]
+        entries = {
+            name: _lone_camera(file) for name, file in zip(("cam0", "cam1"), files, strict=True)
+        }
+        notes.append(f"{files[0]} is the left camera, {files[1].name} the right one")
     names = [name for name in ("cam0", "cam1") if name in entries]
     blocks = [section(entries, name, str(path)) for name in names]
     where = [f"{path}, {name}" for name in names]
     cameras = [_camera(*of_one) for of_one in zip(blocks, where, strict=True)]
     cam1 = cameras[1] if "cam1" in names else None
     T_cam0_imu = _imu_pose(blocks[0], where[0])
-    notes: list[str] = []
     T_cam1_cam0 = _stereo_pose(blocks[1], T_cam0_imu, path, notes) if "cam1" in names else None
     notes += _further_cameras(entries, names, path)
     noise, imu_notes = _imu_beside(path)
@@ -90,6 +101,31 @@ def read_camchain(path: Path) -> Rig:
     return checked_rig(rig, path)
 
 
+def _one_file_each(path: Path) -> tuple[Path, Path] | None:
+    """Return the files of the left and the right camera where a file holds one camera on the IMU,
+    and another one beside it, named as the other side, the other; None: it does not.
+    """
+    if _lone_camera(path) is None:
+        return None
+    beside = sorted(file.name for file in path.parent.glob(f"*{path.suffix}"))
+    pairs = [pair for pair in pairs_of(beside) if path.name in pair]
+    pair = first_pair(pairs)
+    files = None if pair is None else (path.with_name(pair[0]), path.with_name(pair[1]))
+    return None if files is None or any(_lone_camera(file) is None for file in files) else files
+
+
+def _lone_camera(file: Path) -> object:
+    """Return the block of a file's only camera, on an IMU; None: the file holds something else."""
+    try:
+        entries = read_yaml_file(file, "Kalibr's calibration of the cameras")
+    except DataError:
+        return None
+    block = entries.get("cam0")
+    if "cam1" in entries or not is_camchain(entries) or not isinstance(block, dict):
+        return None
+    return block if {"T_cam_imu", "T_imu_cam"} & block.keys() else None
+
+
 def _further_cameras(entries: Entries, names: Sequence[str], path: Path) -> list[str]:
     """Return a note on the cameras that are not used, where there are some."""
     further = sorted(name for name in entries if name.startswith("cam") and name not in names)
@@ -110,6 +146,7 @@ def _stereo_pose(
     if T_cam0_imu is not None and T_cam1_imu is not None:
         through_imu = T_cam1_imu @ se3_inverse(T_cam0_imu)
         if T_cam1_cam0 is None:
+            check_direction(through_imu, se3_inverse(T_cam1_imu) @ T_cam0_imu, where)
             return through_imu
         if _apart(T_cam1_cam0, through_imu):
             notes.append(
