@@ -403,3 +403,33 @@ def test_a_doubt_about_stretched_images_has_a_factor_for_each_axis(tmp_path: Pat
     file.write_text(f"P0: {K.format(0)}\nP1: {K.format(-70)}\n")
     (note,) = vio.load_rig(file, image_size=(1024, 648)).notes
     assert "divide its focal lengths and principal points by 1.25 along x and 1.11 along y" in note
+
+
+def _with_counters(path: Path) -> None:
+    """Put both cameras' images into `img`, list them by camera, and count the lines of the IMU."""
+    (path / "img").mkdir()
+    for side, name in enumerate(("left", "right")):
+        lines = ["# id timestamp image_name"]
+        for k, stamp in enumerate(STAMPS):
+            moved = f"img/image_{side}_{k}.png"
+            (path / name / f"{k}.png").rename(path / moved)
+            lines.append(f"{k} {stamp // 10**9}.{stamp % 10**9:09d} {moved}")
+        (path / f"{name}_images.txt").write_text("\n".join(lines) + "\n")
+        (path / name).rmdir()
+    head, *rows = (path / "imu.csv").read_text().splitlines()
+    rows = [f"{k},{row}" for k, row in enumerate(rows)]
+    (path / "imu.csv").write_text("\n".join([head.replace("#", "# id,"), *rows]) + "\n")
+
+
+def test_a_folder_with_counters_in_its_lists_is_read(tmp_path: Path) -> None:
+    """As UZH-FPV is published: `img/image_0_12.png`, lists of id, time and name."""
+    expected = _samples(make_plain(tmp_path / "apart"))
+    folder = make_plain(tmp_path / "counted", times=False)
+    _with_counters(folder)
+    dataset = open_dataset(folder)
+    assert dataset.recording.kind == "plain"
+    assert dataset.recording.frame_times_ns.tolist() == STAMPS
+    found = _samples(folder)
+    assert found[0] == expected[0]
+    np.testing.assert_array_equal(found[1], expected[1])
+    assert split_sides(["image_0_5.png", "image_1_5.png", "image_0_6.png", "image_1_6.png"])

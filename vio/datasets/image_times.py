@@ -29,7 +29,7 @@ from vio.files.text import text_lines
 from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
 from vio.records import NS_PER_S, IntArray
 
-_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
+_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "left_images.txt")
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 _LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
 _TIMED = 100  # images, of which names that are times show it
@@ -455,6 +455,7 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
     rows, stated = time_lines(file)
     chosen = (
         _by_name_first(rows, pairs)
+        or _by_name_last(rows, pairs)
         or _by_number_or_time_first(rows, pairs)
         or _in_order(rows, pairs)
         or _of_all_images(rows, pairs)
@@ -482,6 +483,15 @@ def _by_name_first(
     if not by_name or not all(left.stem in by_name for left, _ in pairs):
         return None
     return [by_name[left.stem] for left, _ in pairs]
+
+
+def _by_name_last(
+    rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs
+) -> list[tuple[int, str]] | None:
+    """Return line and time of each pair from lines 'number time name'; None: they are others."""
+    if not rows or any(len(fields) != 3 or not fields[0].isdigit() for _, fields in rows):
+        return None
+    return _by_name_first([(n, [fields[2], fields[1]]) for n, fields in rows], pairs)
 
 
 def _in_order(
