@@ -20,7 +20,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
-from vio.files.pose_columns import PoseColumns, pose_columns
+from vio.files.pose_columns import PoseColumns, are_geographic, pose_columns
 from vio.files.stamps import POSE_PACE, parse_stamps
 from vio.files.text import exact_text, lines_of, seconds_text, whole_ns_stamps
 from vio.files.units import header_cells, split_cells
@@ -139,6 +139,11 @@ def read_trajectory(
     _check_columns(table, kind, as_requested=fmt is not None)
     if kind == "kitti":
         return Trajectory(_kitti_poses(table), None, body or _DEFAULT_BODY[kind])
+    if are_geographic(table.comments):
+        raise DataError(
+            f"{table.path}: its header names latitude and longitude, which are no metres; give "
+            "positions in metres, as a local frame of east, north and up has them"
+        )
     columns = pose_columns(table.comments, len(table.fields(0)), w_first=kind == "euroc")
     times_ns = _times_ns(table, columns, kind)
     poses, orientations = _quaternion_poses(table, columns, kind)
