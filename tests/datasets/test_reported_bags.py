@@ -105,3 +105,17 @@ def test_frames_state_the_baseline_where_infos_contradict_it(
     assert any("gives no positive baseline; the baseline of" in note for note in recording.notes)
     with pytest.raises(CalibrationError, match=r"both are at one place|its sign is wrong"):
         open_dataset(_with_frames(*shifts, frames=False).write(tmp_path / "g"))
+
+
+@pytest.mark.parametrize(("unit", "size"), [("microseconds", 1000), ("milliseconds", 1_000_000)])
+def test_nanoseconds_that_hold_a_larger_unit_are_called_so(
+    unit: str, size: int, tmp_path: Path
+) -> None:
+    def short(time_ns: int) -> int:
+        return time_ns // 10**9 * 10**9 + time_ns % 10**9 // size
+
+    true = [START_NS - 900_000_000 + STEP_NS * k for k in range(600)]
+    assert _imu_of(open_dataset(_with_imu(true).write(tmp_path / "true")))
+    bag = _with_imu([short(time_ns) for time_ns in true]).write(tmp_path / "short")
+    with pytest.raises(DataError, match=f"/imu: all its stamps .* as where {unit} were written"):
+        open_dataset(bag)

@@ -433,3 +433,31 @@ def test_a_folder_with_counters_in_its_lists_is_read(tmp_path: Path) -> None:
     assert found[0] == expected[0]
     np.testing.assert_array_equal(found[1], expected[1])
     assert split_sides(["image_0_5.png", "image_1_5.png", "image_0_6.png", "image_1_6.png"])
+
+
+def test_files_of_a_phones_logger_are_found(tmp_path: Path) -> None:
+    """`Gyro.txt` and `Accel.txt` were named as not used, and `gyro_accel.csv` too."""
+    expected = _samples(make_plain(tmp_path / "apart"))
+    one = make_plain(tmp_path / "one")
+    table = (one / "imu.csv").rename(one / "gyro_accel.csv").read_text().splitlines()[1:]
+    two = make_plain(tmp_path / "two", imu=False)
+    rows = [line.split(",") for line in table]
+    (two / "Gyro.txt").write_text("".join(f"{','.join(row[:4])}\n" for row in rows))
+    (two / "Accel.txt").write_text("".join(f"{','.join([row[0], *row[4:]])}\n" for row in rows))
+    for folder in (one, two):
+        found = _samples(folder)
+        assert found[0] == expected[0]
+        np.testing.assert_allclose(found[1], expected[1], atol=1e-12)
+
+
+@pytest.mark.parametrize("rows", [2, 3])
+def test_images_of_twice_the_height_may_be_those_of_both_cameras(rows: int, tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, folders=("left", "other"), imu=False)
+    for file in (folder / "left").iterdir():
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        assert cv2.imwrite(str(file), np.vstack([image] * rows))
+    shutil.rmtree(folder / "other")
+    with pytest.raises(DataError, match="pixels") as caught:
+        list(open_dataset(folder).events())
+    assert ("one above the other" in str(caught.value)) is (rows == 2)

@@ -239,3 +239,43 @@ def test_a_camera_matrix_that_is_nine_numbers_of_a_projection_is_read(tmp_path: 
     rig = vio.load_rig(tmp_path)
     assert (rig.cam0.fu, rig.cam0.fv, rig.cam0.cu, rig.cam0.cv) == (400, 410, 320, 240)
     assert rig.right[1][0, 3] == pytest.approx(-0.11)
+
+
+# --- what a calibration states and the estimate does not use
+
+
+def _imu_of_openvins(scale: float) -> dict[str, object]:
+    noise = {
+        f"{sensor}_{kind}": 1e-3
+        for sensor in ("accelerometer", "gyroscope")
+        for kind in ("noise_density", "random_walk")
+    }
+    return {**noise, "Tw": np.diag([scale, 1.0, 1.0]).tolist(), "Ta": np.eye(3).tolist()}
+
+
+@pytest.mark.parametrize(("scale", "is_said"), [(1.05, True), (1.0005, False)])
+def test_scale_and_misalignment_of_an_imu_are_said_to_be_left_out(
+    scale: float, is_said: bool, tmp_path: Path
+) -> None:
+    forms.kalibr(tmp_path)
+    sheet = _imu_of_openvins(scale)
+    for content in ({"imu0": sheet}, sheet):
+        (tmp_path / "imu.yaml").write_text(yaml.safe_dump(content))
+        notes = vio.load_rig(tmp_path).notes
+        assert any("Tw (up to 5 % off" in note for note in notes) is is_said
+    sheet = {**_imu_of_openvins(1.0), "gyroscopes": {"M": np.diag([scale, 1, 1]).tolist()}}
+    (tmp_path / "imu.yaml").write_text(yaml.safe_dump(sheet))
+    assert any("gyroscopes: M (up to" in n for n in vio.load_rig(tmp_path).notes) is is_said
+
+
+@pytest.mark.parametrize(("delay_s", "is_said"), [(-3e-5, True), (1e-6, False)])
+def test_a_rolling_shutter_is_said_to_be_left_out(
+    delay_s: float, is_said: bool, tmp_path: Path
+) -> None:
+    forms.kalibr(tmp_path)
+    file = tmp_path / "camchain-imucam.yaml"
+    chain = yaml.safe_load(file.read_text())
+    chain["cam0"]["line_delay"] = delay_s
+    file.write_text(yaml.safe_dump(chain))
+    notes = vio.load_rig(file).notes
+    assert any("rolling shutter of 21.6 ms from the first row" in n for n in notes) is is_said

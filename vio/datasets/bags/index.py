@@ -63,6 +63,8 @@ _SDK_MODELS = {
     "brown conrady": "plumb_bob",
     "kannala brandt4": "equidistant",
 }
+_SMALLER = {"milliseconds": 1_000_000, "microseconds": 1000}  # nanoseconds in each
+_MIN_A_SECOND = 5  # stamps, that do not lie at its beginning by chance
 _MOVING = "/tf, "  # how the moving frames are named among the streams
 
 
@@ -419,6 +421,7 @@ def _settle_stamps(index: BagIndex, roles: Roles) -> None:
     streams = _streams(index, roles)
     behind_ns = _behind_the_log(index)
     for name, rows in streams.items():
+        _check_digits(name, rows.times_ns)
         if isinstance(rows, Rows):
             index.notes += _stamped(name, rows, behind_ns)
         if any(rows is samples for samples in (index.imu, index.accel, index.velocities)):
@@ -556,6 +559,22 @@ def _of_one_stamp(name: str, rows: Stamps | Rows, behind_ns: int) -> list[str]:
         f"{count} of {len(rows)} messages of {name} have the stamp of another one, though they "
         "differ, and are left out; a driver that repeats stamps is to be mended"
     ]
+
+
+def _check_digits(name: str, times_ns: Sequence[int]) -> None:
+    """Raise DataError where a driver put microseconds or milliseconds into the nanoseconds."""
+    stamps = np.array(times_ns, dtype=np.int64)
+    stamps = stamps[stamps != 0]
+    seconds, counts = np.unique(stamps // NS_PER_S, return_counts=True)
+    most = int((stamps % NS_PER_S).max(initial=0))
+    unit = next((name for name, size in _SMALLER.items() if most < NS_PER_S // size), None)
+    # the seconds in the middle are whole
+    if unit is None or len(seconds) < 3 or counts[1:-1].min() < _MIN_A_SECOND or most == 0:
+        return
+    raise DataError(
+        f"{name}: all its stamps lie within the first {most} ns of a second, as where {unit} were "
+        f"written into their nanoseconds; multiply these by {_SMALLER[unit]}"
+    )
 
 
 def _begins_at_zero(rows: Rows) -> bool:
