@@ -461,3 +461,13 @@ def test_images_of_twice_the_height_may_be_those_of_both_cameras(rows: int, tmp_
     with pytest.raises(DataError, match="pixels") as caught:
         list(open_dataset(folder).events())
     assert ("one above the other" in str(caught.value)) is (rows == 2)
+
+
+def test_names_that_are_times_stand_behind_them(tmp_path: Path) -> None:
+    """Lines `1700000000000000000 1700000000000000000.png` were read as name and time."""
+    name = lambda side, k: f"{STAMPS[k]}.png"  # noqa: E731
+    folder = make_plain(tmp_path, name=name, times=False)
+    lines = [f"{stamp + 7} {stamp}.png" for stamp in STAMPS]
+    (folder / "timestamps.txt").write_text("\n".join(lines) + "\n")
+    times = open_dataset(folder).recording.frame_times_ns
+    assert times.tolist() == [stamp + 7 for stamp in STAMPS]

@@ -279,3 +279,41 @@ def test_a_rolling_shutter_is_said_to_be_left_out(
     file.write_text(yaml.safe_dump(chain))
     notes = vio.load_rig(file).notes
     assert any("rolling shutter of 21.6 ms from the first row" in n for n in notes) is is_said
+
+
+# --- matrices of NumPy and MATLAB
+
+
+def _matrices(rig: Rig) -> dict[str, np.ndarray]:
+    """The matrices of a pair by names of a common tutorial."""
+    cam1, T = rig.right
+    named = {}
+    for side, camera in (("L", rig.cam0), ("R", cam1)):
+        named |= {f"mtx{side}": camera.K, f"dist{side}": np.array([camera.coefficients])}
+    return {**named, "R": T[:3, :3], "T": T[:3, 3:]}
+
+
+def test_arrays_of_numpy_are_read(tmp_path: Path) -> None:
+    truth = forms.true_rig()
+    file = tmp_path / "stereo.npz"
+    np.savez(file, **_matrices(truth))
+    rig = vio.load_rig(file, image_size=SIZE)
+    np.testing.assert_allclose(rig.right[1], truth.right[1], atol=1e-12)
+    np.testing.assert_allclose(rig.cam0.coefficients, truth.cam0.coefficients)
+
+
+def test_archives_without_plain_arrays_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "stereo.npz"
+    np.savez(file, mtxL=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(CalibrationError, match="no archive of NumPy with plain arrays"):
+        vio.load_rig(file, image_size=SIZE)
+    file.write_bytes(b"PK\x03\x04 cut")
+    with pytest.raises(CalibrationError, match="no archive of NumPy with plain arrays"):
+        vio.load_rig(file, image_size=SIZE)
+
+
+def test_a_transposed_matrix_is_called_so(tmp_path: Path) -> None:
+    matrices = _matrices(forms.true_rig())
+    np.savez(tmp_path / "stereo.npz", **{**matrices, "mtxL": matrices["mtxL"].T})
+    with pytest.raises(CalibrationError, match="it is transposed, as MATLAB has it"):
+        vio.load_rig(tmp_path / "stereo.npz", image_size=SIZE)

@@ -18,7 +18,7 @@ from vio.datasets.dates import dates_in_names
 from vio.datasets.frame_times import PAIRED_NS, nearest, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImagePairs
-from vio.datasets.images import list_images
+from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.lost_images import CountedApart
 from vio.datasets.sides import without_side
 from vio.datasets.tables import drive_times, is_date, table_rows
@@ -482,6 +482,8 @@ def _by_name_first(
     by_name = {Path(fields[0]).stem: (n, fields[1]) for n, fields in rows if len(fields) > 1}
     if not by_name or not all(left.stem in by_name for left, _ in pairs):
         return None
+    if all(Path(time).suffix.lower() in SUFFIXES for _, time in by_name.values()):
+        return None  # 'time name', where the name is the time
     return [by_name[left.stem] for left, _ in pairs]
 
 

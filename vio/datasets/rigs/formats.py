@@ -47,7 +47,7 @@ from vio.datasets.rigs.kimera import pair_beside, read_kimera
 from vio.datasets.rigs.kitti_odometry import kitti_rig
 from vio.datasets.rigs.middlebury import is_middlebury, read_middlebury
 from vio.datasets.rigs.names import named_calibration
-from vio.datasets.rigs.opencv import is_opencv, read_entries, rig_from_opencv
+from vio.datasets.rigs.opencv import is_opencv, read_arrays, read_entries, rig_from_opencv
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import Source, stereo_pose_on_imu
 from vio.datasets.sides import side_word
@@ -162,6 +162,8 @@ def _entries(path: Path) -> Entries:
     suffix = path.suffix.lower()
     if suffix == ".json":
         return read_json_file(path)
+    if suffix == ".npz":
+        return read_arrays(path)
     if suffix == ".conf":
         return zed.read_conf(path)
     if suffix == ".xml":
