@@ -471,3 +471,34 @@ def test_names_that_are_times_stand_behind_them(tmp_path: Path) -> None:
     (folder / "timestamps.txt").write_text("\n".join(lines) + "\n")
     times = open_dataset(folder).recording.frame_times_ns
     assert times.tolist() == [stamp + 7 for stamp in STAMPS]
+
+
+def test_readings_may_be_dated(tmp_path: Path) -> None:
+    expected = _samples(make_plain(tmp_path / "apart"))
+    folder = make_plain(tmp_path / "dated")
+    head, *rows = (folder / "imu.csv").read_text().splitlines()
+    for form, separator in (("{}Z", ","), ("{}+00:00", ";"), ("{}", ",")):
+        lines = [head.replace("#timestamp [ns]", "time").replace(",", separator)]
+        for row in rows:
+            stamp, *values = row.split(",")
+            date = np.datetime64(int(stamp), "ns").astype(str)
+            lines.append(separator.join([form.format(date), *values]))
+        (folder / "imu.csv").write_text("\n".join(lines) + "\n")
+        found = _samples(folder)
+        assert found[0] == expected[0]
+        np.testing.assert_array_equal(found[1], expected[1])
+
+
+@pytest.mark.parametrize(("late_ns", "is_read"), [(1_000_000, True), (60_000_000, False)])
+def test_a_list_may_have_the_times_of_both_cameras(
+    late_ns: int, is_read: bool, tmp_path: Path
+) -> None:
+    name = lambda side, k: f"frame_{k}.png"  # noqa: E731
+    folder = make_plain(tmp_path, name=name, times=False, imu=False)
+    lines = [f"{k},{stamp},{stamp + late_ns}" for k, stamp in enumerate(STAMPS)]
+    (folder / "times.csv").write_text("\n".join(["frame,left [ns],right [ns]", *lines]) + "\n")
+    if is_read:
+        assert open_dataset(folder).recording.frame_times_ns.tolist() == STAMPS
+        return
+    with pytest.raises(DataError, match="there must be one time an image"):
+        open_dataset(folder)

@@ -457,6 +457,7 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
         _by_name_first(rows, pairs)
         or _by_name_last(rows, pairs)
         or _by_number_or_time_first(rows, pairs)
+        or _of_left_camera(rows, pairs)
         or _in_order(rows, pairs)
         or _of_all_images(rows, pairs)
     )
@@ -518,6 +519,25 @@ def _by_number_or_time_first(
     if by_name is not None:
         return by_name
     if not all(fields[0].isdigit() for _, fields in rows):
+        return None
+    return _by_number({int(fields[0]): (n, fields[1]) for n, fields in rows}, pairs)
+
+
+def _of_left_camera(
+    rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs
+) -> list[tuple[int, str]] | None:
+    """Return line and time of each pair from lines 'number left right', whose two times are closer
+    than those of two frames; None: the lines are others.
+    """
+    if len(rows) < 2 or not all(
+        len(fields) == 3
+        and fields[0].isdigit()
+        and all(re.fullmatch(_NUMBER, field) for field in fields)
+        for _, fields in rows
+    ):
+        return None
+    left, right = np.array([fields[1:] for _, fields in rows], dtype=np.float64).T
+    if np.abs(right - left).max() >= np.median(np.abs(np.diff(left))):
         return None
     return _by_number({int(fields[0]): (n, fields[1]) for n, fields in rows}, pairs)
 

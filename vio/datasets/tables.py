@@ -17,7 +17,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.datasets.common import check_gravity_column
-from vio.datasets.dates import date_ns
+from vio.datasets.dates import date_ns, undated
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.files.stamps import SAMPLE_PACE, Pace, parse_stamps
@@ -145,7 +145,7 @@ def table_rows(
     """
     above = _LinesAbove(columns, [] if comments is None else comments)
     is_data = False
-    lines = ((number, line.strip()) for number, line in lines_of(path))
+    lines = ((number, undated(line.strip())) for number, line in lines_of(path))
     for number, text in lines:
         if not is_data and above.take(number, text):
             continue
@@ -411,7 +411,7 @@ def holds_readings(path: Path) -> bool:
 
 def _columns(path: Path) -> int:
     """Return the number of columns of a table; 0: it holds no line of data."""
-    rows = (split_cells(line.strip()) for _, line in lines_of(path))
+    rows = (split_cells(undated(line.strip())) for _, line in lines_of(path))
     return next((len(fields) for fields in rows if _NUMBER.fullmatch(fields[0])), 0)
 
 
