@@ -145,7 +145,10 @@ def table_rows(
     """
     above = _LinesAbove(columns, [] if comments is None else comments)
     is_data = False
-    lines = ((number, undated(line.strip())) for number, line in lines_of(path))
+    lines = (
+        (number, undated(text) if (text := line.strip())[4:5] == "-" else text)
+        for number, line in lines_of(path)
+    )
     for number, text in lines:
         if not is_data and above.take(number, text):
             continue

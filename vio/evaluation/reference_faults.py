@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.records import NS_PER_S, IntArray, Trajectory
+from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
 
 class _FaultRules(NamedTuple):
@@ -17,6 +17,7 @@ class _FaultRules(NamedTuple):
 
     min_share: float = 0.005  # of the path, that the error must be before anything is looked for
     min_poses: int = 20
+    max_poses: int = 500  # of a long record, evenly chosen
     explained: float = 0.33  # of the error, that may be left by what explains it
     max_shift_s: float = 40.0  # the 37 s between TAI and UTC, and the 18 s of GPS
     overlap: float = 0.5  # share of the poses that must have a reference at a shift
@@ -47,10 +48,10 @@ def position_fault(
     if len(x) < _FAULT.min_poses:
         return None
     path_m = float(np.linalg.norm(np.diff(y, axis=0), axis=1).sum())
-    error_m = float(_errors(x[None], y[None])[0])
+    error_m = float(_errors(x, y)[0])
     if not error_m > _FAULT.min_share * path_m:
         return None
-    mirrored_m = float(_errors(x[None], (y * [-1.0, 1.0, 1.0])[None])[0])
+    mirrored_m = float(_errors(x, y * [-1.0, 1.0, 1.0])[0])
     if mirrored_m < _FAULT.explained * error_m:
         return (
             "the positions agree where one axis of the reference is mirrored (ATE after Sim(3) "
@@ -65,7 +66,8 @@ def _clock_fault(estimate: Trajectory, reference: Trajectory) -> str | None:
     if estimate.times_ns is None or reference.times_ns is None:
         return None
     start_ns = int(estimate.times_ns[0])
-    times = (estimate.times_ns - start_ns) / NS_PER_S
+    chosen = slice(None, None, -(-len(estimate) // _FAULT.max_poses))
+    times = (estimate.times_ns[chosen] - start_ns) / NS_PER_S
     known = (reference.times_ns - start_ns) / NS_PER_S
     span_s = min(float(np.ptp(times)), float(np.ptp(known)))
     reach_s = min(_FAULT.max_shift_s, (1 - _FAULT.overlap) * span_s)
@@ -74,7 +76,9 @@ def _clock_fault(estimate: Trajectory, reference: Trajectory) -> str | None:
     count = _FAULT.steps
     for _ in range(3):
         shifts: FloatArray = shift_s + step_s * np.arange(-count, count + 1, dtype=np.float64)
-        left, ratios = _of_shifts(estimate.positions, times, reference.positions, known, shifts)
+        left, ratios = _of_shifts(
+            estimate.positions[chosen], times, reference.positions, known, shifts
+        )
         best = int(np.argmin(ratios))
         shift_s = float(shifts[best])
         step_s /= _FAULT.finer
@@ -99,33 +103,34 @@ def _of_shifts(
     """Return the errors (S,) that are left where a reference is late by shifts (S,), and their ratio
     to those of the same poses without; infinite where too few have a reference.
     """
+    at = times + shifts[:, None]
+    used = (at >= known[0]) & (at <= known[-1]) & (times >= known[0]) & (times <= known[-1])
+    moved = np.stack([np.interp(at, known, y[:, axis]) for axis in range(3)], axis=-1)
+    given = np.stack([np.interp(times, known, y[:, axis]) for axis in range(3)], axis=-1)
+    enough = used.sum(axis=1) >= max(_FAULT.min_poses, _FAULT.overlap * len(times))
     left = np.full(len(shifts), np.inf)
     ratios = np.full(len(shifts), np.inf)
-    inside = (times >= known[0]) & (times <= known[-1])
-    for k, shift in enumerate(shifts.tolist()):
-        at = times + shift
-        both = inside & (at >= known[0]) & (at <= known[-1])
-        if both.sum() < max(_FAULT.min_poses, _FAULT.overlap * len(times)):
-            continue
-        moments = np.stack([at[both], times[both]])
-        found = np.stack([np.interp(moments, known, y[:, axis]) for axis in range(3)], axis=-1)
-        left[k], without = _errors(np.stack([x[both], x[both]]), found)
-        ratios[k] = left[k] / without if without > 0 else np.inf
+    if enough.any():
+        left[enough] = _errors(x, moved[enough], used[enough])
+        without = _errors(x, given, used[enough])
+        ratios[enough] = left[enough] / np.maximum(without, np.finfo(np.float64).tiny)
     return left, ratios
 
 
-def _errors(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the root mean square distances (B,) of points x (B, M, 3) to y after the similarity
-    that makes them least.
+def _errors(x: FloatArray, y: FloatArray, used: BoolArray | None = None) -> FloatArray:
+    """Return the root mean square distances (B,) of points x (M, 3) to y (M, 3) or (B, M, 3) after
+    the similarity that makes them least; of those that are used (B, M), all if None.
 
     Reference: Umeyama (1991), equation 34.
     """
-    x = x - x.mean(axis=1, keepdims=True)
-    y = y - y.mean(axis=1, keepdims=True)
-    U, d, Vt = np.linalg.svd(np.swapaxes(y, 1, 2) @ x)
+    weights = np.ones((1, len(x))) if used is None else used.astype(np.float64)
+    weights = (weights / weights.sum(axis=1, keepdims=True))[..., None]
+    x = x - np.sum(weights * x, axis=1, keepdims=True)
+    y = y - np.sum(weights * y, axis=1, keepdims=True)
+    U, d, Vt = np.linalg.svd(np.swapaxes(y, 1, 2) @ (weights * x))
     d[:, 2] *= np.sign(np.linalg.det(U @ Vt))
-    squares = np.sum(x**2, axis=(1, 2))
+    squares = np.sum(weights * x**2, axis=(1, 2))
     gain = np.divide(d.sum(axis=1) ** 2, squares, out=np.zeros(len(x)), where=squares > 0)
-    rest = np.sum(y**2, axis=(1, 2)) - gain
-    out: FloatArray = np.sqrt(np.maximum(rest, 0.0) / x.shape[1])
+    rest = np.sum(weights * y**2, axis=(1, 2)) - gain
+    out: FloatArray = np.sqrt(np.maximum(rest, 0.0))
     return out
