@@ -369,6 +369,15 @@ class Fields:
 GRAY = np.random.default_rng(0).integers(0, 256, (8, 12)).astype(np.uint8)
 COLOUR = np.random.default_rng(1).integers(0, 256, (8, 12, 3)).astype(np.uint8)
 ALPHA = np.dstack([COLOUR, GRAY])
+
+
+def _planar(encoding: str, *, pad: int = 0) -> Fields:
+    """A gray image whose rows of colour follow behind its height."""
+    fields = Fields(np.vstack([GRAY, GRAY[:4]]), encoding, pad=pad)
+    fields.height = len(GRAY)
+    return fields
+
+
 ENCODINGS = {
     "mono8": (Fields(GRAY, "mono8"), GRAY),
     "8UC1, padded rows": (Fields(GRAY, "8UC1", pad=4), GRAY),
@@ -380,6 +389,8 @@ ENCODINGS = {
     "mono16": (Fields(GRAY.astype(np.uint16) * 257, "mono16"), GRAY.astype(np.uint16) * 257),
     "mono16, big-endian": (Fields(GRAY.astype(">u2"), "mono16", big=True), GRAY.astype(np.uint16)),
     "yuv422_yuy2": (Fields(np.dstack([GRAY, GRAY // 2]), "yuv422_yuy2"), GRAY),
+    "nv12": (_planar("nv12"), GRAY),
+    "nv21, padded rows": (_planar("nv21", pad=4), GRAY),
     "yuv422": (Fields(np.dstack([GRAY // 2, GRAY]), "yuv422"), GRAY),
 }
 

@@ -403,3 +403,102 @@ def test_a_doubt_about_stretched_images_has_a_factor_for_each_axis(tmp_path: Pat
     file.write_text(f"P0: {K.format(0)}\nP1: {K.format(-70)}\n")
     (note,) = vio.load_rig(file, image_size=(1024, 648)).notes
     assert "divide its focal lengths and principal points by 1.25 along x and 1.11 along y" in note
+
+
+def _with_counters(path: Path) -> None:
+    """Put both cameras' images into `img`, list them by camera, and count the lines of the IMU."""
+    (path / "img").mkdir()
+    for side, name in enumerate(("left", "right")):
+        lines = ["# id timestamp image_name"]
+        for k, stamp in enumerate(STAMPS):
+            moved = f"img/image_{side}_{k}.png"
+            (path / name / f"{k}.png").rename(path / moved)
+            lines.append(f"{k} {stamp // 10**9}.{stamp % 10**9:09d} {moved}")
+        (path / f"{name}_images.txt").write_text("\n".join(lines) + "\n")
+        (path / name).rmdir()
+    head, *rows = (path / "imu.csv").read_text().splitlines()
+    rows = [f"{k},{row}" for k, row in enumerate(rows)]
+    (path / "imu.csv").write_text("\n".join([head.replace("#", "# id,"), *rows]) + "\n")
+
+
+def test_a_folder_with_counters_in_its_lists_is_read(tmp_path: Path) -> None:
+    """As UZH-FPV is published: `img/image_0_12.png`, lists of id, time and name."""
+    expected = _samples(make_plain(tmp_path / "apart"))
+    folder = make_plain(tmp_path / "counted", times=False)
+    _with_counters(folder)
+    dataset = open_dataset(folder)
+    assert dataset.recording.kind == "plain"
+    assert dataset.recording.frame_times_ns.tolist() == STAMPS
+    found = _samples(folder)
+    assert found[0] == expected[0]
+    np.testing.assert_array_equal(found[1], expected[1])
+    assert split_sides(["image_0_5.png", "image_1_5.png", "image_0_6.png", "image_1_6.png"])
+
+
+def test_files_of_a_phones_logger_are_found(tmp_path: Path) -> None:
+    """`Gyro.txt` and `Accel.txt` were named as not used, and `gyro_accel.csv` too."""
+    expected = _samples(make_plain(tmp_path / "apart"))
+    one = make_plain(tmp_path / "one")
+    table = (one / "imu.csv").rename(one / "gyro_accel.csv").read_text().splitlines()[1:]
+    two = make_plain(tmp_path / "two", imu=False)
+    rows = [line.split(",") for line in table]
+    (two / "Gyro.txt").write_text("".join(f"{','.join(row[:4])}\n" for row in rows))
+    (two / "Accel.txt").write_text("".join(f"{','.join([row[0], *row[4:]])}\n" for row in rows))
+    for folder in (one, two):
+        found = _samples(folder)
+        assert found[0] == expected[0]
+        np.testing.assert_allclose(found[1], expected[1], atol=1e-12)
+
+
+@pytest.mark.parametrize("rows", [2, 3])
+def test_images_of_twice_the_height_may_be_those_of_both_cameras(rows: int, tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, folders=("left", "other"), imu=False)
+    for file in (folder / "left").iterdir():
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        assert cv2.imwrite(str(file), np.vstack([image] * rows))
+    shutil.rmtree(folder / "other")
+    with pytest.raises(DataError, match="pixels") as caught:
+        list(open_dataset(folder).events())
+    assert ("one above the other" in str(caught.value)) is (rows == 2)
+
+
+def test_names_that_are_times_stand_behind_them(tmp_path: Path) -> None:
+    """Lines `1700000000000000000 1700000000000000000.png` were read as name and time."""
+    name = lambda side, k: f"{STAMPS[k]}.png"  # noqa: E731
+    folder = make_plain(tmp_path, name=name, times=False)
+    lines = [f"{stamp + 7} {stamp}.png" for stamp in STAMPS]
+    (folder / "timestamps.txt").write_text("\n".join(lines) + "\n")
+    times = open_dataset(folder).recording.frame_times_ns
+    assert times.tolist() == [stamp + 7 for stamp in STAMPS]
+
+
+def test_readings_may_be_dated(tmp_path: Path) -> None:
+    expected = _samples(make_plain(tmp_path / "apart"))
+    folder = make_plain(tmp_path / "dated")
+    head, *rows = (folder / "imu.csv").read_text().splitlines()
+    for form, separator in (("{}Z", ","), ("{}+00:00", ";"), ("{}", ",")):
+        lines = [head.replace("#timestamp [ns]", "time").replace(",", separator)]
+        for row in rows:
+            stamp, *values = row.split(",")
+            date = np.datetime64(int(stamp), "ns").astype(str)
+            lines.append(separator.join([form.format(date), *values]))
+        (folder / "imu.csv").write_text("\n".join(lines) + "\n")
+        found = _samples(folder)
+        assert found[0] == expected[0]
+        np.testing.assert_array_equal(found[1], expected[1])
+
+
+@pytest.mark.parametrize(("late_ns", "is_read"), [(1_000_000, True), (60_000_000, False)])
+def test_a_list_may_have_the_times_of_both_cameras(
+    late_ns: int, is_read: bool, tmp_path: Path
+) -> None:
+    name = lambda side, k: f"frame_{k}.png"  # noqa: E731
+    folder = make_plain(tmp_path, name=name, times=False, imu=False)
+    lines = [f"{k},{stamp},{stamp + late_ns}" for k, stamp in enumerate(STAMPS)]
+    (folder / "times.csv").write_text("\n".join(["frame,left [ns],right [ns]", *lines]) + "\n")
+    if is_read:
+        assert open_dataset(folder).recording.frame_times_ns.tolist() == STAMPS
+        return
+    with pytest.raises(DataError, match="there must be one time an image"):
+        open_dataset(folder)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vio.errors import DataError
 from vio.evaluation.trajectories import evaluate
 from vio.files.trajectories import is_trajectory_file, read_trajectory, write_tum
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_from_parts, so3_exp
@@ -212,3 +213,17 @@ def test_decimal_commas_between_semicolons_or_tabs_are_read(separator: str, tmp_
     read = read_trajectory(local)
     np.testing.assert_array_equal(read.T_world_body, expected.T_world_body)
     assert read.times_ns.tolist() == expected.times_ns.tolist()
+
+
+def test_whole_matrices_are_read(tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = [0.0, 1.5, 2.5]
+    file = tmp_path / "poses.txt"
+    np.savetxt(file, poses.reshape(3, 16))
+    found = read_trajectory(file)
+    np.testing.assert_array_equal(found.T_world_body, poses)
+    assert found.body == "cam0"
+    poses[1, 3, 3] = 2.0
+    np.savetxt(file, poses.reshape(3, 16))
+    with pytest.raises(DataError, match="line 2: the last of 16 columns are not 0 0 0 1"):
+        read_trajectory(file)

@@ -462,9 +462,14 @@ def camera_from_matrix(
     """
     M = np.asarray(K, dtype=np.float64)
     if M.shape != (3, 3) or not np.allclose(M[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], atol=1e-8):
+        mirrored = M.shape == (3, 3) and np.allclose(M[:2, 2], 0) and M[2, 0] > 0 and M[2, 1] > 0
+        remedy = (
+            "it is transposed, as MATLAB has it: transpose it, and the rotation between the cameras"
+            if mirrored
+            else "check its order"
+        )
         raise CalibrationError(
-            f"{name} is no intrinsic matrix [fu 0 cu; 0 fv cv; 0 0 1] but {M.tolist()}; check its "
-            "order"
+            f"{name} is no intrinsic matrix [fu 0 cu; 0 fv cv; 0 0 1] but {M.tolist()}; {remedy}"
         )
     if abs(M[0, 1]) > 1e-8 * abs(M[0, 0]):
         raise CalibrationError(

@@ -45,7 +45,9 @@ from vio.records import (
     Trajectory,
 )
 
-IMU_FILES = ("imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv")
+IMU_FILES = (
+    "imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv", "gyro_accel.csv",
+)  # fmt: skip
 # of a gyro and an accelerometer that have a file each
 _GYRO_FILES = ("gyro.csv", "gyro.txt", "gyr.csv", "gyr.txt", "gyroscope.csv", "gyroscope.txt")
 _ACCEL_FILES = (
@@ -287,8 +289,15 @@ def imu_files(*folders: Path) -> tuple[Path, ...]:
 
 def _first_file(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
     """Return the first file of some names, in the first folder that has one; None: there is none."""
-    files = (folder / name for folder in folders for name in names)
-    return next((file for file in files if file.is_file()), None)
+    for folder in folders:
+        files = (folder / name for name in names)
+        if (found := next((file for file in files if file.is_file()), None)) is not None:
+            return found
+        listed = {file.name.lower(): file for file in folder.iterdir()} if folder.is_dir() else {}
+        found = next((listed[name] for name in names if name in listed), None)
+        if found is not None and found.is_file():
+            return found  # as a phone's logger names them: Gyro.txt
+    return None
 
 
 def _read_imu(files: Sequence[Path], notes: list[str]) -> tuple[ImuRecord, Sequence[str]]:

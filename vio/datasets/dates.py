@@ -39,6 +39,16 @@ def date_ns(text: str) -> int:
     return int(np.datetime64(written, "ns").astype(np.int64))
 
 
+def undated(line: str) -> str:
+    """Return a line of a table that begins with a date of ISO 8601 with its nanoseconds since 1970
+    instead; others as they are.
+    """
+    if line[4:5] != "-" or (found := _WRITTEN.match(line)) is None:
+        return line
+    rest = line[found.end() :]
+    return f"{date_ns(found[0])}{rest}" if rest[:1] in ",;\t " else line
+
+
 def dates_in_names(stems: Sequence[str]) -> IntArray | None:
     """Return the dates (N,) that names state to a fraction of a second; None: they state others."""
     times = list[int]()

@@ -18,7 +18,7 @@ from vio.datasets.dates import dates_in_names
 from vio.datasets.frame_times import PAIRED_NS, nearest, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImagePairs
-from vio.datasets.images import list_images
+from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.lost_images import CountedApart
 from vio.datasets.sides import without_side
 from vio.datasets.tables import drive_times, is_date, table_rows
@@ -29,7 +29,7 @@ from vio.files.text import text_lines
 from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
 from vio.records import NS_PER_S, IntArray
 
-_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
+_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "left_images.txt")
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 _LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
 _TIMED = 100  # images, of which names that are times show it
@@ -455,7 +455,9 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
     rows, stated = time_lines(file)
     chosen = (
         _by_name_first(rows, pairs)
+        or _by_name_last(rows, pairs)
         or _by_number_or_time_first(rows, pairs)
+        or _of_left_camera(rows, pairs)
         or _in_order(rows, pairs)
         or _of_all_images(rows, pairs)
     )
@@ -481,7 +483,18 @@ def _by_name_first(
     by_name = {Path(fields[0]).stem: (n, fields[1]) for n, fields in rows if len(fields) > 1}
     if not by_name or not all(left.stem in by_name for left, _ in pairs):
         return None
+    if all(Path(time).suffix.lower() in SUFFIXES for _, time in by_name.values()):
+        return None  # 'time name', where the name is the time
     return [by_name[left.stem] for left, _ in pairs]
+
+
+def _by_name_last(
+    rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs
+) -> list[tuple[int, str]] | None:
+    """Return line and time of each pair from lines 'number time name'; None: they are others."""
+    if not rows or any(len(fields) != 3 or not fields[0].isdigit() for _, fields in rows):
+        return None
+    return _by_name_first([(n, [fields[2], fields[1]]) for n, fields in rows], pairs)
 
 
 def _in_order(
@@ -506,6 +519,25 @@ def _by_number_or_time_first(
     if by_name is not None:
         return by_name
     if not all(fields[0].isdigit() for _, fields in rows):
+        return None
+    return _by_number({int(fields[0]): (n, fields[1]) for n, fields in rows}, pairs)
+
+
+def _of_left_camera(
+    rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs
+) -> list[tuple[int, str]] | None:
+    """Return line and time of each pair from lines 'number left right', whose two times are closer
+    than those of two frames; None: the lines are others.
+    """
+    if len(rows) < 2 or not all(
+        len(fields) == 3
+        and fields[0].isdigit()
+        and all(re.fullmatch(_NUMBER, field) for field in fields)
+        for _, fields in rows
+    ):
+        return None
+    left, right = np.array([fields[1:] for _, fields in rows], dtype=np.float64).T
+    if np.abs(right - left).max() >= np.median(np.abs(np.diff(left))):
         return None
     return _by_number({int(fields[0]): (n, fields[1]) for n, fields in rows}, pairs)
 

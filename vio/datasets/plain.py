@@ -76,7 +76,9 @@ _PAIRS: tuple[tuple[str, ...], ...] = (
     ("stereo_left", "stereo_right"), ("stereo/left", "stereo/right"), ("img_l", "img_r"),
     ("undistorted_images/cam0", "undistorted_images/cam1"),
 )  # fmt: skip
-ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
+ALONE = (
+    "left", "Left", "cam0", "image_0", "image_00", "image", "images", "img", "rgb", "color", "mono",
+)  # fmt: skip
 _GRAY = (0, 1)  # of KITTI
 _COLOUR = (2, 3)
 _INSIDE = ("data", "images", "")

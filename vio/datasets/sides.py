@@ -19,6 +19,7 @@ _SIDES = (
     ("a", "b"),
 )
 _CAMERAS = ("cam", "camera", "infra", "fisheye")  # whose number tells them apart
+_IMAGES = ("image", "img")  # likewise, where a number of the frame follows
 _WORDS = re.compile(r"\d+|[A-Z]?[a-z]+|[A-Z]+(?![a-z])|/|\\")
 
 
@@ -102,7 +103,10 @@ def _side_at(words: tuple[str, ...], k: int) -> str | None:
     for left, right in _SIDES[:3]:
         if words[k] in (left, right):
             return "left" if words[k] == left else "right"
-    if k and words[k] in ("0", "1") and words[k - 1] in _CAMERAS:
+    if not k or words[k] not in ("0", "1"):
+        return None
+    counted = words[k + 1 : k + 2] and words[k + 1].isdigit()  # image_0_17: camera, number
+    if words[k - 1] in _CAMERAS or (counted and words[k - 1] in _IMAGES):
         return "left" if words[k] == "0" else "right"
     return None
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.datasets.common import check_gravity_column
-from vio.datasets.dates import date_ns
+from vio.datasets.dates import date_ns, undated
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.files.stamps import SAMPLE_PACE, Pace, parse_stamps
@@ -44,6 +44,7 @@ _NUMBER = re.compile(
 _SECONDS = re.compile(r"(^|[^n])secs?$|seconds?$")  # ends of names in small letters
 _NANOSECONDS = re.compile(r"n(ano)?secs?$|nanoseconds?$")
 _PLAIN = re.compile(r"[0-9.eE+-]*")  # numbers in these are written as `_NUMBER` says, or are none
+_COUNTERS = ("", "id", "no", "num", "number", "index", "idx", "seq", "row", "line", "sample")
 _IMU_COLUMNS = 7
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
 _MAX_LATE = 0.05  # share of lines that may have been written late
@@ -144,7 +145,10 @@ def table_rows(
     """
     above = _LinesAbove(columns, [] if comments is None else comments)
     is_data = False
-    lines = ((number, line.strip()) for number, line in lines_of(path))
+    lines = (
+        (number, undated(text) if (text := line.strip())[4:5] == "-" else text)
+        for number, line in lines_of(path)
+    )
     for number, text in lines:
         if not is_data and above.take(number, text):
             continue
@@ -410,7 +414,7 @@ def holds_readings(path: Path) -> bool:
 
 def _columns(path: Path) -> int:
     """Return the number of columns of a table; 0: it holds no line of data."""
-    rows = (split_cells(line.strip()) for _, line in lines_of(path))
+    rows = (split_cells(undated(line.strip())) for _, line in lines_of(path))
     return next((len(fields) for fields in rows if _NUMBER.fullmatch(fields[0])), 0)
 
 
@@ -419,7 +423,7 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
     count = _columns(path)
     if count <= _IMU_COLUMNS:
         return read_table(path, _IMU_COLUMNS, _IMU_FORM, cut)
-    table = _joined_stamps(read_table(path, count, _IMU_FORM, cut))
+    table = _joined_stamps(_without_counter(read_table(path, count, _IMU_FORM, cut)))
     order = _imu_order(table) if table.header else None
     named = [bool(re.search(r"time|stamp|sec|\bt\b", cell)) for cell in table.header]
     if any(named) and not named[0]:
@@ -436,6 +440,19 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
         header=(table.header[0], *(table.header[1 + k] for k in order)),
         values=table.values[:, order],
     )
+
+
+def _without_counter(table: NumberTable) -> NumberTable:
+    """Return a table without the first column where its header calls it a counter of the lines, and
+    the second one the time.
+    """
+    names = [re.sub(r"[^a-z]", "", cell) for cell in table.header[:2]]
+    if len(names) < 2 or names[0] not in _COUNTERS or not re.search(r"time|stamp", names[1]):
+        return table
+    # their digits, of which numbers keep sixteen
+    rows = itertools.islice(table_rows(table.path, len(table.header), _IMU_FORM, []), 1, None)
+    stamps = tuple(fields[1] for _, fields in rows)
+    return replace(table, header=table.header[1:], stamps=stamps, values=table.values[:, 1:])
 
 
 def _joined_stamps(table: NumberTable) -> NumberTable:

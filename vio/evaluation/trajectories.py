@@ -37,6 +37,7 @@ from vio.evaluation.errors_along_path import (
 )
 from vio.evaluation.quaternion_order import settled_orders
 from vio.evaluation.reference_axes import attitude_note
+from vio.evaluation.reference_faults import position_fault
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.records import BodyFrame, IntArray, Trajectory
 
@@ -215,6 +216,7 @@ def evaluate(
     aligned = replace(moved, T_world_body=apply_alignment(alignment, moved.T_world_body))
     T_aligned = aligned.T_world_body[rows]
     errors_deg = rotation_angle_deg(se3_inverse(T_ref) @ T_aligned)
+    fault = position_fault(moved, reference, T_est, T_ref)
     return Evaluation(
         align=align,
         association=association,
@@ -253,7 +255,8 @@ def evaluate(
             *(_row_note(moved, reference) if association == "frame" else ()),
             *order_notes,
             *(
-                _positions_alone(estimate, reference)
+                ((fault,) if fault is not None else ())
+                or _positions_alone(estimate, reference)
                 or _attitude_notes(alignment, T_est, T_ref, T_aligned)
             ),
         ),

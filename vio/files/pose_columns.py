@@ -61,6 +61,18 @@ def pose_columns(headers: Sequence[str], count: int, *, w_first: bool) -> PoseCo
     return PoseColumns(0, (1, 2, 3), quaternion, orientations, unit)
 
 
+def are_geographic(headers: Sequence[str]) -> bool:
+    """Return whether the last header of a table names latitude and longitude."""
+    names = (
+        [re.sub(r"[^a-z]", "", without_unit(cell)) for cell in split_cells(headers[-1].lower())]
+        if headers
+        else []
+    )
+    return any(name.startswith("lat") for name in names) and any(
+        name.startswith(("lon", "lng")) for name in names
+    )
+
+
 def _assumed_order(headers: Sequence[str], *, w_first: bool) -> tuple[bool, Orientations]:
     """Return whether w is the first component of the quaternions, and whether a header says it."""
     for text in reversed(headers):

@@ -20,7 +20,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
-from vio.files.pose_columns import PoseColumns, pose_columns
+from vio.files.pose_columns import PoseColumns, are_geographic, pose_columns
 from vio.files.stamps import POSE_PACE, parse_stamps
 from vio.files.text import exact_text, lines_of, seconds_text, whole_ns_stamps
 from vio.files.units import header_cells, split_cells
@@ -44,6 +44,7 @@ ROTATION_TOLERANCE = 1e-3
 _MIN_COLUMNS = 4  # a stamp and a position
 _POSE_COLUMNS = 8
 _KITTI_COLUMNS = 12
+_WHOLE_COLUMNS = 16  # of KITTI's form with the last row of each pose, 0 0 0 1
 _WHOLE = re.compile(r"[+-]?\d+")
 
 
@@ -57,7 +58,7 @@ class _PoseRules(NamedTuple):
 _POSES = _PoseRules()
 _COLUMNS: dict[TrajectoryFormat, str] = {
     "tum": "8 columns 'timestamp tx ty tz qx qy qz qw'",
-    "kitti": "12 columns, the first three rows of a 4x4 pose",
+    "kitti": "12 columns, the first three rows of a 4x4 pose (or 16, all four)",
     "euroc": "at least 8 comma-separated columns 'timestamp [ns], px, py, pz, qw, qx, qy, qz'",
 }
 _EUROC_HEADER = (
@@ -139,6 +140,11 @@ def read_trajectory(
     _check_columns(table, kind, as_requested=fmt is not None)
     if kind == "kitti":
         return Trajectory(_kitti_poses(table), None, body or _DEFAULT_BODY[kind])
+    if are_geographic(table.comments):
+        raise DataError(
+            f"{table.path}: its header names latitude and longitude, which are no metres; give "
+            "positions in metres, as a local frame of east, north and up has them"
+        )
     columns = pose_columns(table.comments, len(table.fields(0)), w_first=kind == "euroc")
     times_ns = _times_ns(table, columns, kind)
     poses, orientations = _quaternion_poses(table, columns, kind)
@@ -383,10 +389,11 @@ def _detect(table: _Table) -> TrajectoryFormat:
         return "euroc"
     n = len(table.fields(0))
     named = _names_poses(table, n)
-    if n not in (_MIN_COLUMNS, _POSE_COLUMNS, _KITTI_COLUMNS) and not named:
+    kitti = n in (_KITTI_COLUMNS, _WHOLE_COLUMNS)
+    if n not in (_MIN_COLUMNS, _POSE_COLUMNS) and not (named or kitti):
         forms = "; ".join(f"{kind}: {columns}" for kind, columns in _COLUMNS.items())
         table.fail(0, f"{n} columns fit no known format ({forms})")
-    return "kitti" if n == _KITTI_COLUMNS and not named else "tum"
+    return "kitti" if kitti and not named else "tum"
 
 
 def _names_poses(table: _Table, count: int) -> bool:
@@ -402,6 +409,8 @@ def _check_columns(table: _Table, kind: TrajectoryFormat, *, as_requested: bool)
     expected = {"tum": _POSE_COLUMNS, "kitti": _KITTI_COLUMNS, "euroc": max(count, _POSE_COLUMNS)}[
         kind
     ]
+    if kind == "kitti" and count == _WHOLE_COLUMNS:
+        expected = count
     if kind != "kitti" and (
         count == _MIN_COLUMNS or (not as_requested and _names_poses(table, count))
     ):
@@ -472,6 +481,14 @@ def _quaternion_poses(
 
 
 def _kitti_poses(table: _Table) -> FloatArray:
+    if len(table.fields(0)) == _WHOLE_COLUMNS:
+        last = _floats(table, range(_KITTI_COLUMNS, _WHOLE_COLUMNS))
+        wrong = (last != [0.0, 0.0, 0.0, 1.0]).any(axis=1)
+        if wrong.any():
+            table.fail(
+                int(np.argmax(wrong)),
+                f"the last of {_WHOLE_COLUMNS} columns are not 0 0 0 1, as of a 4x4 pose row by row",
+            )
     values = _floats(table, range(_KITTI_COLUMNS)).reshape(-1, 3, 4)
     R = values[:, :, :3]
     with np.errstate(over="ignore", invalid="ignore"):

@@ -44,6 +44,11 @@ class RowProbe:
         self._rows = 0  # right minus left rows, pixels at half resolution
         self._searched = False
 
+    @property
+    def rows_px(self) -> int:
+        """By how many rows the right image was found to be moved, pixels of the full image."""
+        return 2 * self._rows
+
     def corners(self, half: Image) -> FloatArray:
         """Return strong corners (K, 2) of an image (H/2, W/2), spread evenly, in pixels of the
         full image.

@@ -87,5 +87,18 @@ class SwapDetector(ImageCheck):
             raise DataError(
                 f"frame {index}: left and right images look swapped ({mirrored} of "
                 f"{corners} features match with a negative disparity, {matched} with a positive "
-                f"one, in {_SWAP.frames} frames); exchange the image folders or the cameras' calibration"
+                f"one, in {_SWAP.frames} frames); exchange the image folders or the cameras' "
+                f"calibration{self._other_cause()}"
             )
+
+    def _other_cause(self) -> str:
+        """Return what else such matches may be, where rows are off as well: disparities of raw
+        images are off by as much.
+        """
+        rows_px = self._probe.rows_px
+        return (
+            f"; or, as rows differ by {abs(rows_px)} px, these are raw images and the calibration is "
+            "that of rectified ones: give the one that belongs to them"
+            if rows_px
+            else ""
+        )

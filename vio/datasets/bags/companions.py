@@ -148,7 +148,7 @@ def _rig(found: Contents, file: Path | None) -> Rig:
     if len(set(infos)) != len(topics):
         raise CalibrationError(f"{infos[0]} belongs to both images; give --calibration FILE")
     rectified = _is_rectified(topics[0])
-    if len(stated) > 1 and not states_baseline(stated[1]):
+    if len(stated) > 1 and not states_baseline(*stated):
         T_right_left = _stereo_pose_of_frames(found.index)
         if T_right_left is not None:
             source = found.index.frames_from
@@ -200,6 +200,8 @@ def motion_of(
             "messages), as where gyro and accelerometer are two topics; name both with --topics "
             "imu=/GYRO,accel=/ACCEL, or leave it out with imu=none"
         )
+    if record is None and index.accel and roles.imu is not None:
+        raise DataError(_apart(found))
     if rig.T_cam0_imu is None and (record is not None or index.velocities):
         return in_time_order(), [*notes, _unusable_motion(roles)]
     parts: list[Sequence[MotionSample]] = []
@@ -214,6 +216,21 @@ def motion_of(
         notes.append(f"the twist of {roles.velocity.name} is taken in the frame of T_cam0_imu")
         parts.append(speeds)
     return in_time_order(*parts), notes
+
+
+def _apart(found: Contents) -> str:
+    """Return what is said of a gyro and an accelerometer that no time has both of."""
+    index = found.index
+    assert found.roles.imu is not None
+    spans = [(min(rows.times_ns), max(rows.times_ns)) for rows in (index.imu, index.accel)]
+    (gyro_0, gyro_1), (accel_0, accel_1) = spans
+    accel = found.roles.accel or found.roles.imu
+    return (
+        f"{found.path}: {found.roles.imu.name} (gyro, {gyro_0} to {gyro_1} ns) and {accel.name} "
+        f"(acceleration, {accel_0} to {accel_1} ns) have no time in common: their stamps are of two "
+        "clocks, so they make no IMU; record both with one clock, or leave them out with --topics "
+        "imu=none"
+    )
 
 
 def _left_out_notes(index: BagIndex) -> list[str]:

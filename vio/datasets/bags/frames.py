@@ -26,9 +26,13 @@ _SDK_STREAM = re.compile(r"(.+)/(?:image|imu)/data")
 _SIDEWAYS = 0.7  # share of a baseline that is along the rows of the left image
 
 
-def states_baseline(right: CameraInfo) -> bool:
-    """Return whether the CameraInfo of a right camera states its place: P[0, 3] is not zero."""
-    return bool(right.P[0, 0] > 0 and right.P[0, 3] != 0)
+def states_baseline(left: CameraInfo, right: CameraInfo) -> bool:
+    """Return whether CameraInfos state the place of the right camera: P[0, 3] is not zero there, and
+    puts it to the right of the left camera.
+    """
+    if not (right.P[0, 0] > 0 and right.P[0, 3] != 0):
+        return False
+    return not left.P[0, 0] > 0 or bool(right.P[0, 3] / right.P[0, 0] < left.P[0, 3] / left.P[0, 0])
 
 
 def rig_with_baseline(
@@ -48,14 +52,16 @@ def rig_with_baseline(
     position = se3_inverse(T_right_left)[:3, 3]
     baseline_m = float(np.linalg.norm(position))
     where = infos[1].where
+    stated = float(infos[1].P[0, 3])
+    fault = f"P[0, 3] is {stated:g}" + (" and gives no positive baseline" if stated else "")
     if not position[0] > _SIDEWAYS * baseline_m:
         place = ", ".join(f"{x:.3f}" for x in position)
         raise CalibrationError(
-            f"{where}: P[0, 3] is 0, and the frames of the images put the right camera at {place} m "
+            f"{where}: {fault}, and the frames of the images put the right camera at {place} m "
             "in the left one, not beside it (x to the right, z forward); give a calibration with "
             "--calibration FILE"
         )
-    note = f"{where}: P[0, 3] is 0; the baseline of {baseline_m:.4f} m is that of {source}"
+    note = f"{where}: {fault}; the baseline of {baseline_m:.4f} m is that of {source}"
     left, right = (rig_from_camera_infos([info], rectified=rectified).cam0 for info in infos)
     parallel = np.allclose(T_right_left[:3, :3], np.eye(3), atol=_SAME)
     same = all(
@@ -103,8 +109,8 @@ def _connected(index: BagIndex, roles: Roles, infos: Sequence[str | None]) -> bo
     """Return whether the static frames connect the sensors whose place nothing else states."""
     left = index.left.frame_id.lstrip("/")
     others = [index.imu_frame] if roles.imu is not None else []
-    stated = [index.infos[name] for name in infos[1:] if name in index.infos]
-    if stated and not states_baseline(stated[0]):
+    stated = [index.infos[name] for name in infos if name in index.infos]
+    if len(stated) > 1 and not states_baseline(*stated):
         others.append(index.right.frame_id)
     return all(index.transform(left, name.lstrip("/")) is not None for name in others)
 

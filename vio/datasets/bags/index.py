@@ -47,12 +47,24 @@ class _MixedRules(NamedTuple):
 
 
 _MIXED = _MixedRules()
+
+
+class _SharedStampRules(NamedTuple):
+    """When stamps that samples share are no times of theirs."""
+
+    max_share: float = 0.5  # of the samples that share one with another
+    min_logged_share: float = 0.9  # of the samples that the recorder's clock tells apart
+
+
+_SHARED_STAMPS = _SharedStampRules()
 # Names of RealSense's recorder for the distortions that ROS has names for.
 _SDK_MODELS = {
     "none": "plumb_bob",
     "brown conrady": "plumb_bob",
     "kannala brandt4": "equidistant",
 }
+_SMALLER = {"milliseconds": 1_000_000, "microseconds": 1000}  # nanoseconds in each
+_MIN_A_SECOND = 5  # stamps, that do not lie at its beginning by chance
 _MOVING = "/tf, "  # how the moving frames are named among the streams
 
 
@@ -409,8 +421,11 @@ def _settle_stamps(index: BagIndex, roles: Roles) -> None:
     streams = _streams(index, roles)
     behind_ns = _behind_the_log(index)
     for name, rows in streams.items():
+        _check_digits(name, rows.times_ns)
         if isinstance(rows, Rows):
             index.notes += _stamped(name, rows, behind_ns)
+        if any(rows is samples for samples in (index.imu, index.accel, index.velocities)):
+            index.notes += _of_one_stamp(name, rows, behind_ns)
     _mend_clocks(index, streams)
     for name, rows in streams.items():
         if isinstance(rows, Rows) and not name.startswith(_MOVING):
@@ -517,6 +532,49 @@ def _stamped(name: str, rows: Rows, behind_ns: int) -> list[str]:
     rows.logged_ns = stamped.logged_ns
     rows.values = stamped.values
     return [f"{len(without)} messages of {name} have no stamp and are left out"]
+
+
+def _of_one_stamp(name: str, rows: Stamps | Rows, behind_ns: int) -> list[str]:
+    """Give samples the times of recording where most share their stamp with another one, as where a
+    driver stamps them with the time of the last frame; return a note of samples that differ and
+    share a stamp.
+    """
+    assert isinstance(rows, Rows)
+    times = np.array(rows.times_ns, dtype=np.int64)
+    order = np.argsort(times, kind="stable")
+    values = np.array(rows.values)[order]
+    alike = np.diff(times[order]) == 0
+    count = int((alike & (values[1:] != values[:-1]).any(axis=1)).sum())
+    if not count:
+        return []
+    told_apart = len(set(rows.logged_ns)) > _SHARED_STAMPS.min_logged_share * len(rows)
+    if count > _SHARED_STAMPS.max_share * len(rows) and told_apart:
+        rows.times_ns = [logged_ns + behind_ns for logged_ns in rows.logged_ns]
+        return [
+            f"{count} of {len(rows)} messages of {name} have the stamp of another one, as where a "
+            "driver stamps samples with the time of the last frame; the times of logging are used, "
+            "which jitter"
+        ]
+    return [
+        f"{count} of {len(rows)} messages of {name} have the stamp of another one, though they "
+        "differ, and are left out; a driver that repeats stamps is to be mended"
+    ]
+
+
+def _check_digits(name: str, times_ns: Sequence[int]) -> None:
+    """Raise DataError where a driver put microseconds or milliseconds into the nanoseconds."""
+    stamps = np.array(times_ns, dtype=np.int64)
+    stamps = stamps[stamps != 0]
+    seconds, counts = np.unique(stamps // NS_PER_S, return_counts=True)
+    most = int((stamps % NS_PER_S).max(initial=0))
+    unit = next((name for name, size in _SMALLER.items() if most < NS_PER_S // size), None)
+    # the seconds in the middle are whole
+    if unit is None or len(seconds) < 3 or counts[1:-1].min() < _MIN_A_SECOND or most == 0:
+        return
+    raise DataError(
+        f"{name}: all its stamps lie within the first {most} ns of a second, as where {unit} were "
+        f"written into their nanoseconds; multiply these by {_SMALLER[unit]}"
+    )
 
 
 def _begins_at_zero(rows: Rows) -> bool:

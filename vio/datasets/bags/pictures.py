@@ -19,6 +19,8 @@ from vio.records import Image
 # OpenCV names a Bayer pattern by its second row and column; ROS by its first pixels.
 _BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
 _YUV = {"yuv422": "UYVY", "uyvy": "UYVY", "yuv422_yuy2": "YUY2", "yuyv": "YUY2"}
+# their rows of brightness come first, those of colour behind the image's height
+_PLANAR = ("nv12", "nv21", "nv24", "i420", "yuv420", "yuv420p")
 
 
 def gray_of(
@@ -160,6 +162,8 @@ def _form(encoding: str, where: str, *, bayer: bool, yuv: str | None) -> tuple[s
     """Return the NumPy type and the channels of an encoding of sensor_msgs/image_encodings."""
     if yuv is not None:
         return "u1", 2
+    if encoding.lower() in _PLANAR:  # gray also where colour is asked for
+        return "u1", 1
     if bayer and encoding[6:10] in _BAYER and encoding[10:] in ("8", "16"):
         return f"u{int(encoding[10:]) // 8}", 1
     for name, channels in (("mono", 1), ("bgra", 4), ("rgba", 4), ("bgr", 3), ("rgb", 3)):

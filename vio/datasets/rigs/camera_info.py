@@ -35,6 +35,8 @@ from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts
 from vio.geometry.rectify import vertical_fault
 
+_MIN_BASELINE_M = 0.005  # no stereo camera has less
+
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
@@ -157,22 +159,32 @@ def read_camera_info(path: Path) -> CameraInfo:
     )
     found = {key: section(entries, key, where) for key in wanted}
     D = entries.get("distortion_coefficients", [] if alone else None)
+    K = matrix(found["camera_matrix"], (3, 3), f"{where}, camera_matrix")
+    R = np.eye(3)
+    P = np.zeros((3, 4))
+    if not alone:
+        R = matrix(found["rectification_matrix"], (3, 3), f"{where}, rectification_matrix")
+        P = matrix(found["projection_matrix"], (3, 4), f"{where}, projection_matrix")
     return CameraInfo(
         where,
         width,
         height,
         str(entries.get("distortion_model") or ""),
         tuple(np.ravel(matrix(D, None, f"{where}, distortion_coefficients")).tolist()),
-        matrix(found["camera_matrix"], (3, 3), f"{where}, camera_matrix"),
-        np.eye(3)
-        if alone
-        else matrix(found["rectification_matrix"], (3, 3), f"{where}, rectification_matrix"),
-        np.zeros((3, 4))
-        if alone
-        else matrix(found["projection_matrix"], (3, 4), f"{where}, projection_matrix"),
+        P[:, :3] if _is_cut_projection(K, P) else K,
+        R,
+        P,
         _binning_of(entries),
         _roi_of(entries),
     )
+
+
+def _is_cut_projection(K: FloatArray, P: FloatArray) -> bool:
+    """Return whether K (3, 3) holds the first nine numbers of `K [I | 0]` (3, 4), as RTAB-Map wrote
+    them for years, and P (3, 4) has the same focal lengths, so that it tells K.
+    """
+    whole = np.column_stack([P[:, :3], np.zeros(3)])
+    return bool(P[0, 0] > 0 and (K.ravel() == whole.ravel()[:9]).all())
 
 
 def _binning_of(entries: Entries) -> tuple[int, int]:
@@ -219,7 +231,8 @@ def rig_from_camera_infos(
     """
     infos = [info.of_images(image_size) for info in infos]
     rig = _rig(infos, rectified=rectified)
-    return checked_rig(rig, infos[0].where)
+    doubt = None if rig.cam1 is None else _metres_doubt(rig, infos[1])
+    return checked_rig(rig if doubt is None else rig.noting(doubt), infos[0].where)
 
 
 def _rig(infos: Sequence[CameraInfo], *, rectified: bool) -> Rig:
@@ -246,6 +259,19 @@ def _rig(infos: Sequence[CameraInfo], *, rectified: bool) -> Rig:
     return Rig(cam0, cam1, se3_from_parts(R1.T @ R0, R1.T @ shift))
 
 
+def _metres_doubt(rig: Rig, right: CameraInfo) -> str | None:
+    """Return the doubt about a P[0, 3] that is the baseline itself; None: it may be a product."""
+    baseline = float(np.linalg.norm(rig.right[1][:3, 3]))
+    stated = abs(float(right.P[0, 3]))
+    if baseline >= _MIN_BASELINE_M or not _MIN_BASELINE_M < stated < 1.0:
+        return None
+    return (
+        f"{right.where}: doubtful: P[0, 3] is -focal * baseline, so that {right.P[0, 3]:g} makes a "
+        f"baseline of {baseline:.2g} m; if it is the baseline itself, {stated:g} m, multiply it by "
+        "the focal length"
+    )
+
+
 def _mono_rig(info: CameraInfo, *, rectified: bool) -> Rig:
     K, name = (info.P[:, :3], "P") if rectified else (info.K, "K")
     if not K[0, 0] > 0:
@@ -266,13 +292,29 @@ def _rectified_shift(left: CameraInfo, right: CameraInfo) -> FloatArray:
     if (fault := vertical_fault(shift)) is not None:
         raise CalibrationError(f"{right.where}: {fault}")
     if not shift[0] < 0:
-        raise CalibrationError(
-            f"{right.where}: P gives a stereo baseline of {-shift[0]:g} m, not a positive one "
-            "(P[0, 3] of the right "
-            "camera is -focal * baseline); the cameras are swapped, or were not calibrated as a "
-            "pair"
-        )
+        raise CalibrationError(f"{right.where}: {_no_baseline(left, right, float(-shift[0]))}")
     return shift
+
+
+def _no_baseline(left: CameraInfo, right: CameraInfo, baseline: float) -> str:
+    """Return why a pair of CameraInfos has no positive baseline, and what to do."""
+    stated = float(right.P[0, 3])
+    if baseline != 0.0:
+        return (
+            f"P gives a stereo baseline of {baseline:g} m, not a positive one (P[0, 3] of the right "
+            "camera is -focal * baseline); the cameras are swapped, or its sign is wrong: if this "
+            f"is the right camera, it is {-abs(stated):g}"
+        )
+    remedy = "give the pair's calibration with --calibration FILE"
+    if stated == 0.0:
+        return (
+            "P[0, 3] is 0 here and of the left camera, so no baseline is stated, as of cameras that "
+            f"were calibrated one by one; {remedy}"
+        )
+    return (
+        f"P[0, 3] is {stated:g} here and of the left camera, so both are at one place; that of the "
+        f"left camera is 0 by ROS's convention: correct its CameraInfo, or {remedy}"
+    )
 
 
 def _camera(info: CameraInfo, *, rectified: bool) -> CameraModel:

@@ -32,6 +32,7 @@ from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, se3_
 _CM = 0.01  # metres
 _LEFT = 1  # sockets where none are stated
 _RIGHT = 2
+_NO_SOCKET = 255  # as a byte has -1
 _IMU = "imu"  # in the place of its socket
 # of `cameraType`, by its number
 _TYPES = ("perspective", "fisheye", "equirectangular", "radial division", "cylindrical")
@@ -91,7 +92,11 @@ def _blocks(entries: Entries, where: str) -> Blocks:
         if isinstance(item, (list, tuple)) and len(item) == 2 and isinstance(item[1], dict):
             found[_socket(item[0], -1)] = item[1]
     if not found:
-        raise CalibrationError(f"{where}: cameraData holds no camera; copy the calibration again")
+        raise CalibrationError(
+            f"{where}: cameraData holds no camera: this part of the device's memory was never "
+            "written; take the factory's calibration (readFactoryCalibration), or calibrate the "
+            "device"
+        )
     return found
 
 
@@ -100,7 +105,7 @@ def _socket(value: object, default: int) -> int:
     if isinstance(value, str) and value.upper().startswith("CAM_") and len(value) == 5:
         return ord(value[-1].upper()) - ord("A")
     number = as_number(value)
-    return int(number) if number >= 0 else default
+    return int(number) if 0 <= number < _NO_SOCKET else default
 
 
 def _camera(block: Mapping[str, Any], size: Size | None, where: str) -> CameraModel:

@@ -45,10 +45,11 @@ from vio.datasets.rigs.four_seasons import is_four_seasons, read_four_seasons
 from vio.datasets.rigs.kalibr import is_camchain, read_camchain
 from vio.datasets.rigs.kimera import pair_beside, read_kimera
 from vio.datasets.rigs.kitti_odometry import kitti_rig
+from vio.datasets.rigs.middlebury import is_middlebury, read_middlebury
 from vio.datasets.rigs.names import named_calibration
-from vio.datasets.rigs.opencv import is_opencv, read_entries, rig_from_opencv
+from vio.datasets.rigs.opencv import is_opencv, read_arrays, read_entries, rig_from_opencv
 from vio.datasets.rigs.plausible import checked_rig
-from vio.datasets.rigs.source import Source
+from vio.datasets.rigs.source import Source, stereo_pose_on_imu
 from vio.datasets.sides import side_word
 from vio.datasets.yaml_files import Entries, read_json_file
 from vio.errors import CalibrationError, DataError
@@ -68,7 +69,7 @@ _OTHERS = (".yaml", ".yml", ".json", ".xml", ".conf")  # whose content decides i
 _MAX_OTHERS = 40  # files looked into; a folder with more is no recording's
 # whether entries are of a format, and what reads it; the first that fits does
 _FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] = (
-    (is_camchain, lambda source: read_camchain(source.path)),
+    (is_camchain, lambda source: read_camchain(source.path, alone=source.cameras == 1)),
     (camodocal.matches, camodocal.read),
     (monado.matches, monado.read),
     (okvis.matches, okvis.read),
@@ -161,6 +162,8 @@ def _entries(path: Path) -> Entries:
     suffix = path.suffix.lower()
     if suffix == ".json":
         return read_json_file(path)
+    if suffix == ".npz":
+        return read_arrays(path)
     if suffix == ".conf":
         return zed.read_conf(path)
     if suffix == ".xml":
@@ -200,6 +203,8 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
 def _read_txt(path: Path, image_size: Size | None) -> Rig:
     if bare.is_bare(path):
         return bare.read_bare(path, image_size)
+    if is_middlebury(path):
+        return read_middlebury(path, image_size)
     return kitti_rig(path, image_size)[0]
 
 
@@ -258,7 +263,7 @@ def _euroc(source: Source) -> Rig:
         read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1")
     )
     T_imu_cam0, T_imu_cam1 = (se3_inverse(T_body_imu) @ T for T in (T_body_cam0, T_body_cam1))
-    T_cam1_cam0 = se3_inverse(T_imu_cam1) @ T_imu_cam0
+    T_cam1_cam0 = stereo_pose_on_imu(T_imu_cam0, T_imu_cam1, str(mav))
     with naming(mav):
         return checked_rig(Rig(cam0, cam1, T_cam1_cam0, se3_inverse(T_imu_cam0), noise), mav)
 

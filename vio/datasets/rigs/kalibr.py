@@ -9,6 +9,7 @@ Reference: the page "yaml formats" of Kalibr's documentation; OpenVINS's `config
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,11 @@ import yaml
 from vio.cameras.rig import Rig
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.plausible import checked_rig
+from vio.datasets.rigs.source import check_direction
+from vio.datasets.sides import first_pair, pairs_of
 from vio.datasets.yaml_files import (
     Entries,
+    as_number,
     imu_densities,
     lens_model,
     matrix,
@@ -36,6 +40,10 @@ from vio.records import ImuDensities
 
 _SAME_M = 2e-3  # how far the two statements of the stereo pose may be apart before it is said
 _SAME_RAD = 5e-3
+# of an IMU's readings, as OpenVINS names them
+_IMU_MATRICES = ("Tw", "Ta", "R_IMUtoGYRO", "R_IMUtoACC")
+_IDENTITY = 1e-3  # by which such a matrix may differ from the identity
+_ROLLING_S = 1e-3  # from the first row of an image to the last, below which it is read at once
 
 
 def is_camchain(entries: Entries) -> bool:
@@ -44,8 +52,11 @@ def is_camchain(entries: Entries) -> bool:
     return all(isinstance(camera, dict) and "intrinsics" in camera for camera in cameras)
 
 
-def read_camchain(path: Path) -> Rig:
+def read_camchain(path: Path, *, alone: bool = False) -> Rig:
     """Read a camchain of one camera or two and, beside it, the IMU's file.
+
+    Of two cameras that were calibrated with the IMU one by one, each file has one (`cam0-imu.yaml`
+    and `cam1-imu.yaml`): they are a pair, unless the camera is asked for alone.
 
     A depth camera's `depth_factor`, levels per metre, is no entry of Kalibr's and may be added to
     cam0.
@@ -59,15 +70,22 @@ def read_camchain(path: Path) -> Rig:
         raise CalibrationError(
             f"{path}: is no camchain of Kalibr; it must hold the block cam0 and, for stereo, cam1"
         )
+    notes: list[str] = []
+    if not alone and (files := _one_file_each(path)) is not None:
+        path = files[0]
+        entries = {
+            name: _lone_camera(file) for name, file in zip(("cam0", "cam1"), files, strict=True)
+        }
+        notes.append(f"{files[0]} is the left camera, {files[1].name} the right one")
     names = [name for name in ("cam0", "cam1") if name in entries]
     blocks = [section(entries, name, str(path)) for name in names]
     where = [f"{path}, {name}" for name in names]
     cameras = [_camera(*of_one) for of_one in zip(blocks, where, strict=True)]
     cam1 = cameras[1] if "cam1" in names else None
     T_cam0_imu = _imu_pose(blocks[0], where[0])
-    notes: list[str] = []
     T_cam1_cam0 = _stereo_pose(blocks[1], T_cam0_imu, path, notes) if "cam1" in names else None
     notes += _further_cameras(entries, names, path)
+    notes += _rolling_shutter(blocks[0], cameras[0].height, path)
     noise, imu_notes = _imu_beside(path)
     offset_s = _time_shift(blocks, where)
     residual_px = _residual(blocks[-1], where[-1])
@@ -90,6 +108,43 @@ def read_camchain(path: Path) -> Rig:
     return checked_rig(rig, path)
 
 
+def _one_file_each(path: Path) -> tuple[Path, Path] | None:
+    """Return the files of the left and the right camera where a file holds one camera on the IMU,
+    and another one beside it, named as the other side, the other; None: it does not.
+    """
+    if _lone_camera(path) is None:
+        return None
+    beside = sorted(file.name for file in path.parent.glob(f"*{path.suffix}"))
+    pairs = [pair for pair in pairs_of(beside) if path.name in pair]
+    pair = first_pair(pairs)
+    files = None if pair is None else (path.with_name(pair[0]), path.with_name(pair[1]))
+    return None if files is None or any(_lone_camera(file) is None for file in files) else files
+
+
+def _lone_camera(file: Path) -> object:
+    """Return the block of a file's only camera, on an IMU; None: the file holds something else."""
+    try:
+        entries = read_yaml_file(file, "Kalibr's calibration of the cameras")
+    except DataError:
+        return None
+    block = entries.get("cam0")
+    if "cam1" in entries or not is_camchain(entries) or not isinstance(block, dict):
+        return None
+    return block if {"T_cam_imu", "T_imu_cam"} & block.keys() else None
+
+
+def _rolling_shutter(block: Mapping[str, Any], height: int, path: Path) -> list[str]:
+    """Return a note on a camera whose rows are exposed one after the other."""
+    read_s = abs(as_number(block.get("line_delay", 0.0))) * height
+    if not read_s > _ROLLING_S:
+        return []
+    return [
+        f"{path}: line_delay states a rolling shutter of {1e3 * read_s:.1f} ms from the first row to "
+        "the last, which is not modelled: turns make errors of that time; use a global shutter, or "
+        "move slowly"
+    ]
+
+
 def _further_cameras(entries: Entries, names: Sequence[str], path: Path) -> list[str]:
     """Return a note on the cameras that are not used, where there are some."""
     further = sorted(name for name in entries if name.startswith("cam") and name not in names)
@@ -110,6 +165,7 @@ def _stereo_pose(
     if T_cam0_imu is not None and T_cam1_imu is not None:
         through_imu = T_cam1_imu @ se3_inverse(T_cam0_imu)
         if T_cam1_cam0 is None:
+            check_direction(through_imu, se3_inverse(T_cam1_imu) @ T_cam0_imu, where)
             return through_imu
         if _apart(T_cam1_cam0, through_imu):
             notes.append(
@@ -222,28 +278,55 @@ def _imu_beside(path: Path) -> tuple[ImuDensities | None, tuple[str, ...]]:
     Files of other tools, which may be no YAML at all, are passed over.
     """
     found: list[tuple[Path, ImuDensities]] = []
+    notes: list[str] = []
     for file in sorted([*path.parent.glob("*imu*.yaml"), *path.parent.glob("*imu*.yml")]):
         if "chain" in file.name.replace("imu_chain", "") or file == path or not file.is_file():
             continue
-        noise = _noise_in(file)
+        sheet = _imu_sheet(file)
+        noise = imu_densities(sheet, file)
         if noise is not None:
+            notes += [] if found else _unapplied(sheet, file)
             found.append((file, noise))
     if not found:
         return None, ()
     names = ", ".join(file.name for file, _ in found)
-    return found[0][1], (f"of {names} the first gives the IMU's noise",) if len(found) > 1 else ()
+    if len(found) > 1:
+        notes.append(f"of {names} the first gives the IMU's noise")
+    return found[0][1], tuple(notes)
 
 
-def _noise_in(file: Path) -> ImuDensities | None:
-    """Return the noise that a YAML file states, plain or in the block of its first IMU."""
+def _imu_sheet(file: Path) -> Entries:
+    """Return what a YAML file states of an IMU, plain or in the block of its first one."""
     try:
         entries = read_yaml_file(file, "Kalibr's IMU noise")
     except DataError:
-        return None
+        return {}
     block = entries.get("imu0")
-    if isinstance(block, dict):
-        entries = {str(k): v for k, v in block.items()}
-    return imu_densities(entries, file)
+    return {str(k): v for k, v in block.items()} if isinstance(block, dict) else entries
+
+
+def _unapplied(sheet: Entries, file: Path) -> list[str]:
+    """Return a note on the scale and the misalignment of an IMU, as OpenVINS's `Tw` and `Ta` or
+    Kalibr's `gyroscopes: M` state them.
+    """
+    stated: dict[str, object] = {name: sheet.get(name) for name in _IMU_MATRICES}
+    for sensor in ("gyroscopes", "accelerometers"):
+        block = sheet.get(sensor)
+        if isinstance(block, dict):
+            stated[f"{sensor}: M"] = block.get("M")
+    off = {}
+    for name, value in stated.items():
+        with contextlib.suppress(CalibrationError):
+            if value is not None:
+                off[name] = float(np.abs(matrix(value, (3, 3), name) - np.eye(3)).max())
+    names = [name for name, size in off.items() if size > _IDENTITY]
+    if not names:
+        return []
+    share = 100 * max(off[name] for name in names)
+    return [
+        f"{file}: {', '.join(names)} (up to {share:.2g} % off the identity) are not applied to the "
+        "readings; correct them before, or let vio calibrate-rig measure them"
+    ]
 
 
 def kalibr_text(rig: Rig) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from vio.datasets.common import naming
 from vio.datasets.rigs.plausible import checked_rig, unit_doubt
 from vio.datasets.yaml_files import Entries, as_number, lens_model, matrix, read_yaml_file
 from vio.errors import CalibrationError
+from vio.files.printable import printable
 from vio.geometry.distortion import DistortionModel
 from vio.geometry.lie import FloatArray, checked_transform, so3_exp
 from vio.geometry.rectify import vertical_fault
@@ -75,6 +77,22 @@ def read_entries(path: Path) -> dict[str, object]:
         if here in path.name and beside.is_file():
             entries = {**read(beside), **entries}
     return entries
+
+
+def read_arrays(path: Path) -> dict[str, object]:
+    """Read matrices that NumPy saved by their names.
+
+    Raises:
+        CalibrationError: the file is no archive of NumPy, or holds pickled objects.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name].tolist() for name in arrays.files}
+    except (OSError, ValueError, BadZipFile) as error:
+        raise CalibrationError(
+            f"{path}: is no archive of NumPy with plain arrays ({printable(str(error))}); save the "
+            "matrices of the calibration with numpy.savez"
+        ) from error
 
 
 def rig_from_opencv(entries: Entries, where: str, image_size: tuple[int, int] | None) -> Rig:

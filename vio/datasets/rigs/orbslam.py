@@ -28,6 +28,7 @@ from vio.records import ImuDensities
 
 _NOISE = ("IMU.NoiseGyro", "IMU.GyroWalk", "IMU.NoiseAcc", "IMU.AccWalk")
 _POSES_OF_CAMERA = ("IMU.T_b_c1", "Tbc")
+_SAME_BASELINE = 0.02  # share by which rounded numbers may differ
 _POSES_OF_RIGHT = ("Stereo.T_c1_c2", "Tlr")
 
 
@@ -54,7 +55,7 @@ def _cameras(source: Source) -> Rig:
     entries = source.entries
     where = source.where
     if "LEFT.K" in entries and "RIGHT.K" in entries:
-        return rig_from_opencv(entries, where, source.image_size)
+        return _agreeing(rig_from_opencv(entries, where, source.image_size), entries, where)
     size, stated = _size(source)
     first = "Camera1" if "Camera1.fx" in entries else "Camera"
     cam0 = _camera(entries, first, size, where)
@@ -64,7 +65,7 @@ def _cameras(source: Source) -> Rig:
     if factor is None and pose is not None and "Camera2.fx" in entries:
         cam1 = _camera(entries, "Camera2", size, where)
         with naming(where):
-            rig = Rig(cam0, cam1, se3_inverse(pose))
+            rig = _agreeing(Rig(cam0, cam1, se3_inverse(pose)), entries, where)
     elif factor is None and (baseline := _baseline(entries, cam0, where)) is not None:
         if cam0.model != "pinhole":
             raise CalibrationError(
@@ -74,6 +75,28 @@ def _cameras(source: Source) -> Rig:
         with naming(where):
             rig = Rig.rectified(cam0.fu, cam0.fv, cam0.cu, cam0.cv, baseline, *size)
     return checked_rig(rig, where, size_stated=stated)
+
+
+def _agreeing(rig: Rig, entries: Entries, where: str) -> Rig:
+    """Return a rig whose stereo pose is stated, with a doubt where another entry states another
+    baseline: ORB-SLAM takes its depths from that one.
+    """
+    focal = as_number(entries.get("Camera.fx", 0.0))
+    key = "Stereo.b"
+    other = as_number(entries.get(key))
+    if key not in entries:
+        key = "Camera.bf / Camera.fx"
+        other = as_number(entries.get("Camera.bf")) / focal if focal > 0 else np.nan
+    if not np.isfinite(other):
+        return rig
+    baseline = float(np.linalg.norm(rig.right[1][:3, 3]))
+    if abs(other - baseline) <= _SAME_BASELINE * baseline:
+        return rig
+    return rig.noting(
+        f"{where}: doubtful: the pose of the right camera makes a baseline of {baseline:.4g} m, and "
+        f"{key} one of {other:.4g} m; the pose is read, and if the other is right, all lengths are "
+        f"off by {other / baseline:.3g}"
+    )
 
 
 def _size(source: Source) -> tuple[Size, bool]:

@@ -50,7 +50,8 @@ def checked_rig(rig: Rig, where: Path | str, *, size_stated: bool = True) -> Rig
     Args:
         rig: as read.
         where: the file or topic, for messages.
-        size_stated: whether it states the size of its images, which is then believed.
+        size_stated: whether it states the size of its images, which is then believed, unless no
+            camera has such a principal point.
 
     Raises:
         CalibrationError: a principal point lies outside the images.
@@ -60,6 +61,8 @@ def checked_rig(rig: Rig, where: Path | str, *, size_stated: bool = True) -> Rig
     doubts = [_distance_doubt(rig, where)]
     if not size_stated:
         doubts += [_size_doubt(rig.cam0, where), _aspect_doubt(rig.cam0, where)]
+    else:
+        doubts.append(_other_camera_doubt(rig.cam0, where))
     for doubt in doubts:
         rig = rig if doubt is None else rig.noting(doubt)
     return rig
@@ -161,6 +164,21 @@ def _size_doubt(camera: CameraModel, where: Path | str) -> str | None:
         f"{camera.cv:.0f} is the middle of images of about {2 * camera.cu:.0f} x "
         f"{2 * camera.cv:.0f} pixels, not of {camera.width} x {camera.height}; it is read as that "
         f"of these images; {remedy}"
+    )
+
+
+def _other_camera_doubt(camera: CameraModel, where: Path | str) -> str | None:
+    """Return the doubt about intrinsics that were kept where the size was changed; None: the
+    principal point is near the middle of the stated images along one axis at least.
+    """
+    ratios = np.array([2 * camera.cu / camera.width, 2 * camera.cv / camera.height])
+    if 1 / _IMAGE_SIZE.cropped_ratio <= ratios.max() and ratios.min() <= _IMAGE_SIZE.cropped_ratio:
+        return None
+    return (
+        f"{where}: doubtful: it states images of {camera.width} x {camera.height} pixels, and its "
+        f"principal point {camera.cu:.0f}, {camera.cv:.0f} is the middle of images of about "
+        f"{2 * camera.cu:.0f} x {2 * camera.cv:.0f}; it is read as stated; if its size alone was "
+        "changed, scale focal lengths and principal points with it, or all lengths are off"
     )
 
 

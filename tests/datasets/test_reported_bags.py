@@ -1,0 +1,121 @@
+"""Bags as people record them: stamps that samples share, sensors with two clocks, CameraInfos whose
+baseline only the frames state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rosbags = pytest.importorskip("rosbags", reason="needs rosbags")
+
+from tests.bag_maker import Script  # noqa: E402
+from tests.datasets.test_bags_as_recorded import NAMES, _imu_of, _split  # noqa: E402
+from tests.datasets.test_datasets_bags import START_NS, plain_script  # noqa: E402
+from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
+from vio.errors import CalibrationError, DataError  # noqa: E402
+from vio.geometry.lie import se3_exp  # noqa: E402
+from vio.records import ImuSample  # noqa: E402
+
+STEP_NS = 5_000_000
+
+
+def _with_imu(stamps: list[int], *, logged_at_stamps: bool = False) -> Script:
+    """A recording whose IMU's samples are logged 5 ms apart, each with its number as its rate."""
+    script = plain_script(frames=20)
+    script.notes = [note for note in script.notes if note.topic != "/imu"]
+    for k, stamp in enumerate(stamps):
+        sample = ImuSample(stamp, np.array([0.01 * k, 0.0, 0.1]), np.array([0.0, 0.0, 9.8]))
+        script.imu("/imu", sample, stamp if logged_at_stamps else START_NS + STEP_NS * k)
+    return script
+
+
+def _true(count: int = 200) -> list[int]:
+    return [START_NS + STEP_NS * k for k in range(count)]
+
+
+def test_samples_with_the_time_of_the_last_frame_take_that_of_logging(tmp_path: Path) -> None:
+    stamps = [START_NS + 50_000_000 * (k // 10) for k in range(200)]
+    dataset = open_dataset(_with_imu(stamps).write(tmp_path / "f"))
+    times = [sample.time_ns for sample in _imu_of(dataset)]
+    assert times == _true()[: len(times)]
+    assert any(
+        "180 of 200 messages of /imu have the stamp of" in n for n in dataset.recording.notes
+    )
+
+
+def test_samples_that_no_clock_tells_apart_are_left_out_and_counted(tmp_path: Path) -> None:
+    stamps = [START_NS + 20_000_000 * (k // 4) for k in range(200)]
+    bag = _with_imu(stamps, logged_at_stamps=True).write(tmp_path / "f")
+    dataset = open_dataset(bag)
+    assert np.diff([sample.time_ns for sample in _imu_of(dataset)]).min() == 20_000_000
+    assert any("150 of 200 messages of /imu have the stamp" in n for n in dataset.recording.notes)
+
+
+def test_a_few_shared_stamps_are_counted(tmp_path: Path) -> None:
+    stamps = _true()
+    for k in (20, 40, 60):
+        stamps[k] = stamps[k - 1]
+    dataset = open_dataset(_with_imu(stamps).write(tmp_path / "f"))
+    assert any("3 of 200 messages of /imu" in note for note in dataset.recording.notes)
+    assert stamps[20] in [sample.time_ns for sample in _imu_of(dataset)]
+
+
+def test_messages_that_were_recorded_twice_are_no_shared_stamps(tmp_path: Path) -> None:
+    script = _with_imu(_true())
+    script.notes += [replace(note) for note in script.notes if note.topic == "/imu"]
+    dataset = open_dataset(script.write(tmp_path / "f"))
+    assert not any("have the stamp of another one" in note for note in dataset.recording.notes)
+
+
+def test_a_gyro_and_an_accelerometer_with_two_clocks_are_refused(tmp_path: Path) -> None:
+    gyro, accel = NAMES["realsense"]
+    script = _split(plain_script(frames=4), gyro, accel, vectors=False)
+    for note in script.notes:
+        if note.topic == gyro:
+            note.fields.header.stamp.sec += 1000
+    bag = script.write(tmp_path / "f")
+    with pytest.raises(DataError, match=f"{gyro} .*{accel} .*have no time in common"):
+        open_dataset(bag)
+    assert not _imu_of(open_dataset(bag, DatasetSettings(topics="imu=none")))
+
+
+def _with_frames(left_shift: float, right_shift: float, *, frames: bool) -> Script:
+    """A recording with `P[0, 3]` of both cameras, whose frames may state the baseline."""
+    script = plain_script(frames=4)
+    for note in script.notes:
+        shift = {"/left/camera_info": left_shift, "/right/camera_info": right_shift}
+        if note.topic in shift:
+            P = getattr(note.fields, "P", None)
+            (note.fields.p if P is None else P)[3] = shift[note.topic]
+    if frames:
+        script.static(START_NS, "left", "right", se3_exp([0.11, 0, 0, 0, 0, 0]))
+    return script
+
+
+@pytest.mark.parametrize("shifts", [(-5.0, -5.0), (0.0, 5.0)], ids=["equal", "sign"])
+def test_frames_state_the_baseline_where_infos_contradict_it(
+    shifts: tuple[float, float], tmp_path: Path
+) -> None:
+    recording = open_dataset(_with_frames(*shifts, frames=True).write(tmp_path / "f")).recording
+    assert recording.camera.baseline_m == pytest.approx(0.11)
+    assert any("gives no positive baseline; the baseline of" in note for note in recording.notes)
+    with pytest.raises(CalibrationError, match=r"both are at one place|its sign is wrong"):
+        open_dataset(_with_frames(*shifts, frames=False).write(tmp_path / "g"))
+
+
+@pytest.mark.parametrize(("unit", "size"), [("microseconds", 1000), ("milliseconds", 1_000_000)])
+def test_nanoseconds_that_hold_a_larger_unit_are_called_so(
+    unit: str, size: int, tmp_path: Path
+) -> None:
+    def short(time_ns: int) -> int:
+        return time_ns // 10**9 * 10**9 + time_ns % 10**9 // size
+
+    true = [START_NS - 900_000_000 + STEP_NS * k for k in range(600)]
+    assert _imu_of(open_dataset(_with_imu(true).write(tmp_path / "true")))
+    bag = _with_imu([short(time_ns) for time_ns in true]).write(tmp_path / "short")
+    with pytest.raises(DataError, match=f"/imu: all its stamps .* as where {unit} were written"):
+        open_dataset(bag)

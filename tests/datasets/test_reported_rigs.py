@@ -1,0 +1,319 @@
+"""Calibrations as people have them: entries that contradict one another, a camera in each file, and
+matrices of CameraInfo that state no pair.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import vio
+from tests import calibration_forms as forms
+from tests.calibration_forms import SIZE, T_CAM0_IMU, T_CAM1_CAM0
+from vio.cameras.rig import Rig
+from vio.datasets.rigs.camera_info import CameraInfo, rig_from_camera_infos
+from vio.datasets.rigs.source import stereo_pose_on_imu
+from vio.errors import CalibrationError
+
+
+def _doubts(rig: Rig) -> list[str]:
+    return [note for note in rig.notes if "doubtful" in note]
+
+
+# --- ORB-SLAM's baseline is stated twice
+
+
+@pytest.mark.parametrize(
+    ("write", "pattern", "key"),
+    [
+        (forms.orbslam_old, "Camera.bf: ", "Camera.bf / Camera.fx"),
+        (lambda folder: forms.orbslam3("radtan", folder), "", "Stereo.b"),
+    ],
+    ids=["old", "new"],
+)
+def test_two_baselines_of_orb_slam_are_doubted(
+    write: Callable[[Path], Path], pattern: str, key: str, tmp_path: Path
+) -> None:
+    write(tmp_path)
+    file = tmp_path / "EuRoC.yaml"
+    assert not _doubts(vio.load_rig(file))
+    lines = file.read_text().splitlines()
+    focal = (
+        next(float(line.split()[1]) for line in lines if line.startswith("Camera.fx"))
+        if pattern
+        else 0
+    )
+    kept = [line for line in lines if not pattern or not line.startswith(pattern)]
+    for baseline, is_doubted in ((0.1105, False), (0.06, True)):
+        stated = f"Camera.bf: {focal * baseline}" if pattern else f"Stereo.b: {baseline}"
+        file.write_text("\n".join([*kept, stated]) + "\n")
+        doubts = _doubts(vio.load_rig(file))
+        assert bool(doubts) is is_doubted
+    assert f"{key} one of 0.06 m" in doubts[0]
+
+
+# --- Kalibr's calibrations with an IMU, one camera in a file
+
+
+def _files_of_one_camera(folder: Path, names: tuple[str, str]) -> None:
+    forms.kalibr(folder)
+    chain = yaml.safe_load((folder / "camchain-imucam.yaml").read_text())
+    (folder / "camchain-imucam.yaml").unlink()
+    chain["cam1"].pop("T_cn_cnm1")
+    for name, block in zip(names, ("cam0", "cam1"), strict=True):
+        (folder / name).write_text(yaml.safe_dump({"cam0": chain[block]}))
+
+
+@pytest.mark.parametrize("names", [("cam0-imu.yaml", "cam1-imu.yaml"), ("left.yaml", "right.yaml")])
+def test_two_files_of_one_camera_on_the_imu_are_a_pair(
+    names: tuple[str, str], tmp_path: Path
+) -> None:
+    _files_of_one_camera(tmp_path, names)
+    for path in (tmp_path, tmp_path / names[0], tmp_path / names[1]):
+        rig = vio.load_rig(path)
+        np.testing.assert_allclose(rig.right[1], T_CAM1_CAM0, atol=1e-9)
+        assert rig.T_cam0_imu is not None
+        np.testing.assert_allclose(rig.T_cam0_imu, T_CAM0_IMU, atol=1e-9)
+        assert any(f"{names[1]} the right one" in note for note in rig.notes)
+    assert vio.load_rig(tmp_path / names[0], cameras=1).cam1 is None
+    (tmp_path / names[1]).unlink()
+    assert vio.load_rig(tmp_path / names[0]).cam1 is None
+
+
+# --- Middlebury
+
+MIDDLEBURY = """cam0=[{f} 0 640.5; 0 {f} 360; 0 0 1]
+cam1=[{f} 0 {cx1}; 0 {f} 360; 0 0 1]
+doffs={doffs}
+baseline=110.5
+width=1280
+height=720
+ndisp=280
+"""
+
+
+@pytest.mark.parametrize("doffs", [0.0, 31.25])
+def test_middlebury_is_read(doffs: float, tmp_path: Path) -> None:
+    (tmp_path / "calib.txt").write_text(MIDDLEBURY.format(f=700.25, cx1=640.5 + doffs, doffs=doffs))
+    rig = vio.load_rig(tmp_path)
+    cam1, T_cam1_cam0 = rig.right
+    assert (rig.cam0.width, rig.cam0.height) == SIZE
+    assert (rig.cam0.fu, rig.cam0.cu, cam1.cu - rig.cam0.cu) == (700.25, 640.5, doffs)
+    np.testing.assert_allclose(T_cam1_cam0[:3, 3], [-0.1105, 0.0, 0.0], atol=1e-12)
+    assert not rig.notes
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("baseline=110.5", "baseline=-110.5", "baseline is -110.5; it must be positive"),
+        ("baseline=110.5", "baseline=x", "baseline is 'x', no number"),
+        ("; 0 0 1]", "]", "is no matrix of 3 x 3 numbers"),
+        ("cam0=[7", "cam0=[a", "is no matrix of 3 x 3 numbers"),
+        ("width=1280\n", "", "states no image size"),
+    ],
+)
+def test_bad_files_of_middlebury_are_refused(
+    old: str, new: str, message: str, tmp_path: Path
+) -> None:
+    text = MIDDLEBURY.format(f=700.25, cx1=640.5, doffs=0)
+    assert old in text
+    (tmp_path / "calib.txt").write_text(text.replace(old, new))
+    with pytest.raises(CalibrationError, match=message):
+        vio.load_rig(tmp_path)
+
+
+# --- DepthAI
+
+
+def test_a_device_that_was_not_calibrated_says_so(tmp_path: Path) -> None:
+    file = forms.depthai(tmp_path)
+    value = json.loads(file.read_text())
+    value["stereoRectificationData"] = {"leftCameraSocket": 255, "rightCameraSocket": 255}
+    file.write_text(json.dumps(value))
+    expected = forms.true_rig()
+    np.testing.assert_allclose(vio.load_rig(file).right[1], expected.right[1], atol=1e-9)
+    file.write_text(json.dumps({**value, "cameraData": []}))
+    with pytest.raises(CalibrationError, match="was never written; take the factory's"):
+        vio.load_rig(file)
+
+
+# --- CameraInfo
+
+
+def _info(where: str, shift: float) -> CameraInfo:
+    K = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
+    P = np.column_stack([K, [shift, 0, 0]])
+    return CameraInfo(where, 640, 480, "plumb_bob", (0.0,) * 5, K, np.eye(3), P)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "message"),
+    [
+        (0.0, 0.0, "P.0, 3. is 0 here and of the left camera, so no baseline is stated"),
+        (-44.0, -44.0, "P.0, 3. is -44 here and of the left camera, so both are at one place"),
+        (0.0, 44.0, "baseline of -0.11 m.*or its sign is wrong: .* it is -44"),
+    ],
+)
+def test_infos_without_a_baseline_say_why(left: float, right: float, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        rig_from_camera_infos([_info("l", left), _info("r", right)])
+
+
+@pytest.mark.parametrize(("shift", "is_doubted"), [(-0.11, True), (-44.0, False), (-4.0, False)])
+def test_a_baseline_in_metres_in_the_place_of_a_product_is_doubted(
+    shift: float, is_doubted: bool
+) -> None:
+    doubts = _doubts(rig_from_camera_infos([_info("l", 0.0), _info("r", shift)]))
+    assert bool(doubts) is is_doubted
+    assert not doubts or "if it is the baseline itself, 0.11 m" in doubts[0]
+
+
+# --- poses on the IMU that map the other way
+
+
+def test_poses_on_the_imu_that_were_inverted_are_called_so(tmp_path: Path) -> None:
+    """They were called a vertical pair, whose images should be turned."""
+    T_imu_cam0 = np.array([[0.0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]])
+    T_imu_cam1 = T_imu_cam0 @ np.linalg.inv(T_CAM1_CAM0)
+    with pytest.raises(CalibrationError, match=r"with both poses inverted it is, 0\.11 m away"):
+        stereo_pose_on_imu(np.linalg.inv(T_imu_cam0), np.linalg.inv(T_imu_cam1), "a.yaml")
+    np.testing.assert_allclose(stereo_pose_on_imu(T_imu_cam0, T_imu_cam1, "a"), T_CAM1_CAM0)
+    forms.kalibr(tmp_path)
+    file = tmp_path / "camchain-imucam.yaml"
+    chain = yaml.safe_load(file.read_text())
+    for name, T in (("cam0", T_imu_cam0), ("cam1", T_imu_cam1)):
+        chain[name]["T_cam_imu"] = T.tolist()
+        chain[name].pop("T_cn_cnm1", None)
+    file.write_text(yaml.safe_dump(chain))
+    with pytest.raises(CalibrationError, match="they map the other way than this entry does"):
+        vio.load_rig(file)
+
+
+def test_pairs_that_are_above_one_another_either_way_are_no_inverse() -> None:
+    below = np.eye(4)
+    below[1, 3] = 0.11
+    stereo_pose_on_imu(np.eye(4), below, "a")
+
+
+# --- sizes and matrices that were edited or cut
+
+
+@pytest.mark.parametrize("size", [(1920, 1080), (1280, 720)])
+def test_intrinsics_kept_for_larger_images_are_doubted(
+    size: tuple[int, int], tmp_path: Path
+) -> None:
+    forms.orbslam3("radtan", tmp_path)
+    file = tmp_path / "EuRoC.yaml"
+    text = file.read_text().replace(f"Camera.width: {SIZE[0]}", f"Camera.width: {size[0]}")
+    file.write_text(text.replace(f"Camera.height: {SIZE[1]}", f"Camera.height: {size[1]}"))
+    doubts = _doubts(vio.load_rig(file))
+    assert bool(doubts) is (size != SIZE)
+    assert not doubts or "is the middle of images of about 1274 x 723" in doubts[0]
+
+
+def test_a_camera_matrix_that_is_nine_numbers_of_a_projection_is_read(tmp_path: Path) -> None:
+    """RTAB-Map wrote the first nine numbers of three rows of four."""
+    for name, shift in (("left", 0.0), ("right", -44.0)):
+        P = np.array([[400.0, 0, 320, shift], [0, 410, 240, 0], [0, 0, 1, 0]])
+        entries: dict[str, object] = {
+            "image_width": 640,
+            "image_height": 480,
+            "distortion_model": "plumb_bob",
+        }
+        cut = np.column_stack([P[:, :3], np.zeros(3)]).ravel()[:9]
+        matrices = {
+            "camera_matrix": cut.reshape(3, 3),
+            "rectification_matrix": np.eye(3),
+            "projection_matrix": P,
+            "distortion_coefficients": np.zeros((1, 5)),
+        }
+        for key, M in matrices.items():
+            entries[key] = {"rows": len(M), "cols": len(M[0]), "data": M.ravel().tolist()}
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(entries))
+    rig = vio.load_rig(tmp_path)
+    assert (rig.cam0.fu, rig.cam0.fv, rig.cam0.cu, rig.cam0.cv) == (400, 410, 320, 240)
+    assert rig.right[1][0, 3] == pytest.approx(-0.11)
+
+
+# --- what a calibration states and the estimate does not use
+
+
+def _imu_of_openvins(scale: float) -> dict[str, object]:
+    noise = {
+        f"{sensor}_{kind}": 1e-3
+        for sensor in ("accelerometer", "gyroscope")
+        for kind in ("noise_density", "random_walk")
+    }
+    return {**noise, "Tw": np.diag([scale, 1.0, 1.0]).tolist(), "Ta": np.eye(3).tolist()}
+
+
+@pytest.mark.parametrize(("scale", "is_said"), [(1.05, True), (1.0005, False)])
+def test_scale_and_misalignment_of_an_imu_are_said_to_be_left_out(
+    scale: float, is_said: bool, tmp_path: Path
+) -> None:
+    forms.kalibr(tmp_path)
+    sheet = _imu_of_openvins(scale)
+    for content in ({"imu0": sheet}, sheet):
+        (tmp_path / "imu.yaml").write_text(yaml.safe_dump(content))
+        notes = vio.load_rig(tmp_path).notes
+        assert any("Tw (up to 5 % off" in note for note in notes) is is_said
+    sheet = {**_imu_of_openvins(1.0), "gyroscopes": {"M": np.diag([scale, 1, 1]).tolist()}}
+    (tmp_path / "imu.yaml").write_text(yaml.safe_dump(sheet))
+    assert any("gyroscopes: M (up to" in n for n in vio.load_rig(tmp_path).notes) is is_said
+
+
+@pytest.mark.parametrize(("delay_s", "is_said"), [(-3e-5, True), (1e-6, False)])
+def test_a_rolling_shutter_is_said_to_be_left_out(
+    delay_s: float, is_said: bool, tmp_path: Path
+) -> None:
+    forms.kalibr(tmp_path)
+    file = tmp_path / "camchain-imucam.yaml"
+    chain = yaml.safe_load(file.read_text())
+    chain["cam0"]["line_delay"] = delay_s
+    file.write_text(yaml.safe_dump(chain))
+    notes = vio.load_rig(file).notes
+    assert any("rolling shutter of 21.6 ms from the first row" in n for n in notes) is is_said
+
+
+# --- matrices of NumPy and MATLAB
+
+
+def _matrices(rig: Rig) -> dict[str, np.ndarray]:
+    """The matrices of a pair by names of a common tutorial."""
+    cam1, T = rig.right
+    named = {}
+    for side, camera in (("L", rig.cam0), ("R", cam1)):
+        named |= {f"mtx{side}": camera.K, f"dist{side}": np.array([camera.coefficients])}
+    return {**named, "R": T[:3, :3], "T": T[:3, 3:]}
+
+
+def test_arrays_of_numpy_are_read(tmp_path: Path) -> None:
+    truth = forms.true_rig()
+    file = tmp_path / "stereo.npz"
+    np.savez(file, **_matrices(truth))
+    rig = vio.load_rig(file, image_size=SIZE)
+    np.testing.assert_allclose(rig.right[1], truth.right[1], atol=1e-12)
+    np.testing.assert_allclose(rig.cam0.coefficients, truth.cam0.coefficients)
+
+
+def test_archives_without_plain_arrays_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "stereo.npz"
+    np.savez(file, mtxL=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(CalibrationError, match="no archive of NumPy with plain arrays"):
+        vio.load_rig(file, image_size=SIZE)
+    file.write_bytes(b"PK\x03\x04 cut")
+    with pytest.raises(CalibrationError, match="no archive of NumPy with plain arrays"):
+        vio.load_rig(file, image_size=SIZE)
+
+
+def test_a_transposed_matrix_is_called_so(tmp_path: Path) -> None:
+    matrices = _matrices(forms.true_rig())
+    np.savez(tmp_path / "stereo.npz", **{**matrices, "mtxL": matrices["mtxL"].T})
+    with pytest.raises(CalibrationError, match="it is transposed, as MATLAB has it"):
+        vio.load_rig(tmp_path / "stereo.npz", image_size=SIZE)

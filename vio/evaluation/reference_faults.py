@@ -1,0 +1,136 @@
+"""What makes the positions of a reference differ from an estimate of the same motion: a clock that
+is apart, axes that are left-handed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
+
+
+class _FaultRules(NamedTuple):
+    """When another clock, or another hand, explains the distances of positions."""
+
+    min_share: float = 0.005  # of the path, that the error must be before anything is looked for
+    min_poses: int = 20
+    max_poses: int = 500  # of a long record, evenly chosen
+    explained: float = 0.33  # of the error, that may be left by what explains it
+    max_shift_s: float = 40.0  # the 37 s between TAI and UTC, and the 18 s of GPS
+    overlap: float = 0.5  # share of the poses that must have a reference at a shift
+    steps: int = 200  # of the first search, on either side
+    finer: int = 10  # steps on either side of the best one, twice
+
+
+_FAULT = _FaultRules()
+
+
+def position_fault(
+    estimate: Trajectory, reference: Trajectory, T_est: FloatArray, T_ref: FloatArray
+) -> str | None:
+    """Return what explains the distances between positions after an alignment with scale; None: they
+    are small, or nothing does.
+
+    A scale is part of every alignment here, as one that is off passes for a shift where a body
+    speeds up.
+
+    Args:
+        estimate: the whole trajectory.
+        reference: likewise.
+        T_est: (M, 4, 4) poses that were paired.
+        T_ref: (M, 4, 4) the poses of the reference.
+    """
+    x = T_est[:, :3, 3]
+    y = T_ref[:, :3, 3]
+    if len(x) < _FAULT.min_poses:
+        return None
+    path_m = float(np.linalg.norm(np.diff(y, axis=0), axis=1).sum())
+    error_m = float(_errors(x, y)[0])
+    if not error_m > _FAULT.min_share * path_m:
+        return None
+    mirrored_m = float(_errors(x, y * [-1.0, 1.0, 1.0])[0])
+    if mirrored_m < _FAULT.explained * error_m:
+        return (
+            "the positions agree where one axis of the reference is mirrored (ATE after Sim(3) "
+            f"{mirrored_m:.3g} m, {error_m:.3g} m without): its axes are left-handed, as those of some "
+            "simulators; change the sign of one of them"
+        )
+    return _clock_fault(estimate, reference)
+
+
+def _clock_fault(estimate: Trajectory, reference: Trajectory) -> str | None:
+    """Return the note on a reference whose clock is apart; None: no shift explains the error."""
+    if estimate.times_ns is None or reference.times_ns is None:
+        return None
+    start_ns = int(estimate.times_ns[0])
+    chosen = slice(None, None, -(-len(estimate) // _FAULT.max_poses))
+    times = (estimate.times_ns[chosen] - start_ns) / NS_PER_S
+    known = (reference.times_ns - start_ns) / NS_PER_S
+    span_s = min(float(np.ptp(times)), float(np.ptp(known)))
+    reach_s = min(_FAULT.max_shift_s, (1 - _FAULT.overlap) * span_s)
+    step_s = reach_s / _FAULT.steps
+    shift_s = 0.0
+    count = _FAULT.steps
+    for _ in range(3):
+        shifts: FloatArray = shift_s + step_s * np.arange(-count, count + 1, dtype=np.float64)
+        left, ratios = _of_shifts(
+            estimate.positions[chosen], times, reference.positions, known, shifts
+        )
+        best = int(np.argmin(ratios))
+        shift_s = float(shifts[best])
+        step_s /= _FAULT.finer
+        count = _FAULT.finer
+    if not ratios[best] < _FAULT.explained or abs(shift_s) < _usual_step_s(estimate.times_ns) / 4:
+        return None
+    way = "late" if shift_s > 0 else "early"
+    return (
+        f"the positions agree where the reference's times are {abs(shift_s):.3f} s {way} (ATE after "
+        f"Sim(3) {left[best]:.3g} m, {left[best] / ratios[best]:.3g} m without): its clock is not the "
+        f"estimate's; {'subtract this from' if shift_s > 0 else 'add this to'} its times"
+    )
+
+
+def _usual_step_s(times_ns: IntArray) -> float:
+    return float(np.median(np.diff(times_ns))) / NS_PER_S
+
+
+def _of_shifts(
+    x: FloatArray, times: FloatArray, y: FloatArray, known: FloatArray, shifts: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the errors (S,) that are left where a reference is late by shifts (S,), and their ratio
+    to those of the same poses without; infinite where too few have a reference.
+    """
+    at = times + shifts[:, None]
+    used = (at >= known[0]) & (at <= known[-1]) & (times >= known[0]) & (times <= known[-1])
+    moved = np.stack([np.interp(at, known, y[:, axis]) for axis in range(3)], axis=-1)
+    given = np.stack([np.interp(times, known, y[:, axis]) for axis in range(3)], axis=-1)
+    enough = used.sum(axis=1) >= max(_FAULT.min_poses, _FAULT.overlap * len(times))
+    left = np.full(len(shifts), np.inf)
+    ratios = np.full(len(shifts), np.inf)
+    if enough.any():
+        left[enough] = _errors(x, moved[enough], used[enough])
+        without = _errors(x, given, used[enough])
+        ratios[enough] = left[enough] / np.maximum(without, np.finfo(np.float64).tiny)
+    return left, ratios
+
+
+def _errors(x: FloatArray, y: FloatArray, used: BoolArray | None = None) -> FloatArray:
+    """Return the root mean square distances (B,) of points x (M, 3) to y (M, 3) or (B, M, 3) after
+    the similarity that makes them least; of those that are used (B, M), all if None.
+
+    Reference: Umeyama (1991), equation 34.
+    """
+    weights = np.ones((1, len(x))) if used is None else used.astype(np.float64)
+    weights = (weights / weights.sum(axis=1, keepdims=True))[..., None]
+    x = x - np.sum(weights * x, axis=1, keepdims=True)
+    y = y - np.sum(weights * y, axis=1, keepdims=True)
+    U, d, Vt = np.linalg.svd(np.swapaxes(y, 1, 2) @ (weights * x))
+    d[:, 2] *= np.sign(np.linalg.det(U @ Vt))
+    squares = np.sum(weights * x**2, axis=(1, 2))
+    gain = np.divide(d.sum(axis=1) ** 2, squares, out=np.zeros(len(x)), where=squares > 0)
+    rest = np.sum(weights * y**2, axis=(1, 2)) - gain
+    out: FloatArray = np.sqrt(np.maximum(rest, 0.0))
+    return out
