@@ -163,7 +163,7 @@ CODES: dict[str, Code] = {
     "gyro-jumped": Code(
         "degraded",
         "the gyro's bias has jumped; the images estimate it anew",
-        "check the IMU's mount and supply; an IMU that restarts loses its calibration",
+        "check the IMU's mount and supply",
     ),
     "object-covers-image": Code(
         "degraded",
@@ -188,6 +188,11 @@ CODES: dict[str, Code] = {
     ),
     "depths-repeated": Code("nominal", "depth images repeat an earlier one", _CAMERA),
     "frames-unread": Code("degraded", "frames of the recording could not be read", "see the files"),
+    "view-changed": Code(
+        "unusable",
+        "a frame shows another view than the one before",
+        "add an IMU; keep recordings apart",
+    ),
     "no-features": Code(
         "degraded",
         "no feature can be used; the pose is a prediction",
