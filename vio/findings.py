@@ -100,6 +100,11 @@ CODES: dict[str, Code] = {
         "bands of brightness move through the images; they are taken out",
         "use a light that does not flicker, or an exposure of whole periods of the mains",
     ),
+    "projected-dots": Code(
+        "degraded",
+        "dots of a projector are taken out of the images",
+        "switch the projector off",
+    ),
     "images-exchanged": Code(
         "degraded",
         "left and right images are exchanged for a while; they are put back, or left out",
@@ -127,7 +132,7 @@ CODES: dict[str, Code] = {
     "right-matches-missing": Code(
         "unusable",
         "right matches have not agreed with the left images yet, so lengths are unknown",
-        "vio inspect says whether right images are turned, exchanged or not of this calibration",
+        "vio inspect says why",
     ),
     "right-camera-turned": Code(
         "degraded",
