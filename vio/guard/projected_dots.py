@@ -21,6 +21,7 @@ from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.guard.image_check import FrameImages, ImageCheck
 from vio.numerics.kinds import Capacity
+from vio.numerics.robust import median
 from vio.records import NS_PER_S, Image
 
 
@@ -83,7 +84,8 @@ class ProjectedDots(ImageCheck):
         self._last = time_ns, blocks
         if last is None or elapsed_s > _DOTS.max_s or last[1].shape != blocks.shape:
             return
-        bright, dark, coarse = np.median(np.einsum("pbi,pbi->pb", last[1], blocks), axis=1).tolist()
+        correlations = np.einsum("pbi,pbi->pb", last[1], blocks)
+        bright, dark, coarse = (median(part) for part in correlations)
         is_sign = bright >= _DOTS.min_correlation and bright - max(dark, coarse) >= _DOTS.min_excess
         if not is_sign and coarse < _DOTS.moved_correlation:
             self._since = images.index
