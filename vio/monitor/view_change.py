@@ -66,9 +66,7 @@ class ViewChange:
         if median(np.array(shares[:-1])) < _VIEW.usual_share:
             return []
         if shares[-1] <= _VIEW.lost_share:
-            # a sensor that they do not contradict has measured the motion
-            known = measured and sigmas < _VIEW.apart_sigmas
-            return [_lost(seen.frame_index, len(frames[-2]), again[-1], known=known)]
+            return [_lost(seen.frame_index, len(frames[-2]), again[-1], measured=measured)]
         if imu and _VIEW.apart_sigmas <= sigmas < np.inf:
             return [_apart(seen.frame_index, sigmas)]
         return []
@@ -79,14 +77,14 @@ def _shown_again(before: Observations, after: Observations) -> int:
     return len(shared_rows(before.ids, after.ids)[0])
 
 
-def _lost(index: int, before: int, again: int, *, known: bool) -> Finding:
+def _lost(index: int, before: int, again: int, *, measured: bool) -> Finding:
     """The finding on a frame that shows `again` of the features `before`."""
     figures = {"features_before": float(before), "features_again": float(again)}
     seen = (
         f"frame {index}: {again} of the {before} features of the frame before were found again, and "
         "not where they were expected: the view is another one"
     )
-    if known:
+    if measured:
         message = f"{seen}; the pose is a prediction by the motion sensor"
         return Finding("no-features", message, index, figures=figures)
     message = (
