@@ -100,6 +100,11 @@ CODES: dict[str, Code] = {
         "bands of brightness move through the images; they are taken out",
         "use a light that does not flicker, or an exposure of whole periods of the mains",
     ),
+    "projected-dots": Code(
+        "degraded",
+        "dots of a projector are taken out of the images",
+        "switch the projector off",
+    ),
     "images-exchanged": Code(
         "degraded",
         "left and right images are exchanged for a while; they are put back, or left out",
@@ -127,7 +132,7 @@ CODES: dict[str, Code] = {
     "right-matches-missing": Code(
         "unusable",
         "right matches have not agreed with the left images yet, so lengths are unknown",
-        "vio inspect says whether right images are turned, exchanged or not of this calibration",
+        "vio inspect says why",
     ),
     "right-camera-turned": Code(
         "degraded",
@@ -163,7 +168,7 @@ CODES: dict[str, Code] = {
     "gyro-jumped": Code(
         "degraded",
         "the gyro's bias has jumped; the images estimate it anew",
-        "check the IMU's mount and supply; an IMU that restarts loses its calibration",
+        "check the IMU's mount and supply",
     ),
     "object-covers-image": Code(
         "degraded",
@@ -188,6 +193,11 @@ CODES: dict[str, Code] = {
     ),
     "depths-repeated": Code("nominal", "depth images repeat an earlier one", _CAMERA),
     "frames-unread": Code("degraded", "frames of the recording could not be read", "see the files"),
+    "view-changed": Code(
+        "unusable",
+        "a frame shows another view than the one before",
+        "add an IMU; keep recordings apart",
+    ),
     "no-features": Code(
         "degraded",
         "no feature can be used; the pose is a prediction",

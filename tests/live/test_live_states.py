@@ -5,6 +5,7 @@ worker that has ended.
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import threading
 from collections.abc import Callable
@@ -177,6 +178,60 @@ def test_a_put_that_waits_for_room_is_ended_by_a_failure() -> None:
         live.close()
 
     assert "SystemExit 3 ended" in _within_patience(add_all)
+
+
+def test_a_callback_that_adds_a_frame_to_a_full_queue_does_not_wait_for_itself() -> None:
+    numbers: list[int] = []
+    held: list[LiveOdometry] = []
+    full = threading.Event()
+    added = threading.Event()
+
+    def on_frame(result: FrameResult) -> None:
+        numbers.append(result.frame.index)
+        if len(numbers) == 1:
+            full.wait(_PATIENCE_S)
+            _add(held[0], 2)
+            added.set()
+
+    held.append(
+        LiveOdometry(
+            CAMERA,
+            CONFIG,
+            T_cam0_imu=T_CAM0_IMU,
+            on_frame=on_frame,
+            drop="block",
+            queue_frames=1,
+        )
+    )
+
+    def add_all() -> None:
+        _add(held[0], 0)
+        _add(held[0], 1)
+        full.set()
+        added.wait(_PATIENCE_S)
+        held[0].close()
+
+    assert _within_patience(add_all) == "answers"
+    assert numbers == [0, 1, 2]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_in_a_forked_process_calls_that_need_the_thread_are_refused() -> None:
+    live = _settled()
+    reader, writer = os.pipe()
+    if (child := os.fork()) == 0:  # no thread but this one, and no test beyond here
+        try:
+            said = [_within_patience(lambda name=name: CALLS[name](live)) for name in _WORK]
+            os.write(writer, "\n".join(said).encode())
+        finally:
+            os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as answers:
+        said = answers.read().splitlines()
+    os.waitpid(child, 0)
+    assert len(said) == len(_WORK)
+    assert all("fork" in line for line in said)
+    live.close()
 
 
 def test_calls_from_a_callback_do_not_wait_for_their_own_thread() -> None:

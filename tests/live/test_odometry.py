@@ -361,6 +361,14 @@ def test_wrong_extrinsics_are_refused_with_a_back_end_of_the_callers_own(T: Any)
         )
 
 
+def test_extrinsics_that_the_caller_writes_into_later_are_not_changed() -> None:
+    mine = T_CAM0_IMU.copy()
+    odometry = Odometry(CAMERA, T_cam0_imu=mine)
+    mine[:] = 0.0
+    np.testing.assert_array_equal(odometry.T_cam0_imu, T_CAM0_IMU)
+    np.testing.assert_array_equal(odometry.T_cam0_body, T_CAM0_IMU)
+
+
 def test_a_pixel_that_is_not_seen_may_be_anything() -> None:
     odometry = Odometry(CAMERA, IMAGES_ALONE)
     assert odometry.add_observations(5, [1], [[1, 2, np.nan, np.nan]], [False]) is not None

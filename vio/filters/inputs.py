@@ -37,13 +37,13 @@ def check_parts(name: str, camera: object, settings: object, section: type[Secti
 
 
 def checked_extrinsics(T_cam0_imu: npt.ArrayLike) -> FloatArray:
-    """Return extrinsics (4, 4) as float64, to the bit.
+    """Return a copy of extrinsics (4, 4) as float64, to the bit.
 
     Raises:
         CalibrationError: they are no rigid transform.
     """
     try:
-        T = np.asarray(T_cam0_imu, dtype=np.float64)
+        T = np.array(T_cam0_imu, dtype=np.float64)
     except (ValueError, TypeError) as error:
         raise CalibrationError(
             f"T_cam0_imu is no matrix of numbers ({error}); give a (4, 4) array"

@@ -16,6 +16,7 @@ from vio.guard.never_matched import NeverMatched
 from vio.guard.object_matches import ObjectMatches
 from vio.guard.pairing import PairingCheck
 from vio.guard.probe import RowProbe
+from vio.guard.projected_dots import ProjectedDots
 from vio.guard.swap import SwapDetector
 from vio.guard.turned_pair import TurnedPair
 from vio.protocols import ChecksMatches, ChecksObjects, FollowsRight, Frontend
@@ -40,10 +41,11 @@ def image_checks(camera: StereoCamera) -> tuple[ImageCheck, ...]:
     a turned camera does not have.
     """
     if camera.kind != "stereo":
-        return (LostContrast(),)
+        return (ProjectedDots(), LostContrast())
     probe = RowProbe()
     return (
         BandRemoval(),
+        ProjectedDots(),
         LostContrast(),
         FrozenCamera(),
         TurnedPair(camera, probe),

@@ -1,5 +1,6 @@
-"""A recording whose right images are wrong in the same way from its start, and put right when it is
-read: they belong to the left images of other frames, or are those of a turned camera.
+"""A recording whose images are wrong in the same way from its start, and put right when it is read:
+right ones belong to the left images of other frames, or are those of a turned camera; all show the
+dots of a projector.
 """
 
 from __future__ import annotations
@@ -19,14 +20,15 @@ from vio.records import Event, Image, StereoFrame
 
 @dataclass(frozen=True, slots=True)
 class Repair:
-    """What is put right of a recording's right images."""
+    """What is put right of a recording's images."""
 
     delay: int = 0  # frames by which they are late; negative for early ones
     # (3,) rad, by which their camera shows points p of its rectified frame as `exp(turn) p`
     turn: tuple[float, ...] | None = None
+    dots: bool = False  # projected dots are taken out of all images
 
     def __bool__(self) -> bool:
-        return self.delay != 0 or self.turn is not None
+        return self.delay != 0 or self.turn is not None or self.dots
 
     def adding(self, finding: Finding) -> Repair:
         """Return the repair of what a run found beside this one; itself where that is nothing new.
@@ -34,6 +36,8 @@ class Repair:
         What was put right once is not put right again.
         """
         figures = finding.figures
+        if finding.code == "projected-dots" and finding.since == 0:
+            return replace(self, dots=True)
         if finding.code == "pairs-shifted" and self.delay == 0:
             return replace(self, delay=round(figures["delay_frames"]))
         if finding.code == "right-camera-turned" and self.turn is None and finding.since == 0:
@@ -45,7 +49,9 @@ class Repair:
     def to_json(self) -> dict[str, object] | None:
         """Return it as plain values for `metrics.json`; None: nothing is put right."""
         turn = None if self.turn is None else list(self.turn)
-        return {"late_frames": self.delay, "turned_rad": turn} if self else None
+        if not self:
+            return None
+        return {"late_frames": self.delay, "turned_rad": turn, "dots_taken_out": self.dots}
 
     @classmethod
     def of_json(cls, stated: Mapping[str, Any] | None) -> Repair:
@@ -53,7 +59,11 @@ class Repair:
         if stated is None:
             return cls()
         turn = stated.get("turned_rad")
-        return cls(stated.get("late_frames", 0), None if turn is None else tuple(turn))
+        return cls(
+            stated.get("late_frames", 0),
+            None if turn is None else tuple(turn),
+            stated.get("dots_taken_out", False),
+        )
 
     def lines(self) -> tuple[tuple[str, str], ...]:
         """Return codes, and a line for each, on what a run that began again has put right."""
@@ -72,6 +82,12 @@ class Repair:
                 "images by their times of exposure"
             )
             out.append(("pairs-put-right", line))
+        if self.dots:
+            line = (
+                "the images show the dots of an infrared projector, which move with the cameras; "
+                "the run began again without the dots; switch the projector off"
+            )
+            out.append(("projected-dots", line))
         return tuple(out)
 
 
@@ -90,11 +106,23 @@ def repaired(events: Iterable[Event], repair: Repair, camera: StereoCamera) -> I
         repair: what to put right.
         camera: of the rectified images.
     """
+    if repair.dots:
+        events = _without_dots(events)
     if repair.turn is not None:
         events = _turned_back(events, repair.turn, camera)
     if repair.delay:
         events = _paired(events, abs(repair.delay), right_is_late=repair.delay > 0)
     return iter(events)
+
+
+def _without_dots(events: Iterable[Event]) -> Iterator[Event]:
+    from vio.guard.projected_dots import without_dots  # loads OpenCV
+
+    for event in events:
+        if isinstance(event, StereoFrame):
+            left, right = (x if x is None else without_dots(x) for x in (event.left, event.right))
+            event = replace(event, left=left, right=right)
+        yield event
 
 
 def _turned_back(

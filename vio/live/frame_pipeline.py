@@ -122,7 +122,9 @@ class FramePipeline:
         self.monitor.begun(frame, initialisation.scale_sigma)
         estimate = self.backend.estimate()
         timer.end("update")
-        self.monitor.update(frame.index, report, estimate, has_scale=self._has_scale(chosen))
+        has_scale = self._has_scale(chosen)
+        measured = self._is_measured
+        self.monitor.update(frame.index, report, estimate, has_scale=has_scale, measured=measured)
         self._check_reading(output.observations)
         estimate = self._recovered(frame.index, self.monitor.judged(frame.index, estimate))
         timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
@@ -136,9 +138,14 @@ class FramePipeline:
             _frame_log(frame, timer.ms, output, selection, report, estimate),
         )
 
+    @property
+    def _is_measured(self) -> bool:
+        """Whether a motion sensor carries the pose between frames."""
+        return self._motion is not None and self._imu.used
+
     def _has_scale(self, seen: Observations) -> bool | None:
         """Whether features that are used, or a motion sensor, measure lengths; None: none is seen."""
-        if self._motion is not None and self._imu.used:
+        if self._is_measured:
             return True
         return bool(seen.has_right.any()) if len(seen) else None
 

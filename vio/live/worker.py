@@ -68,8 +68,10 @@ class EventQueue:
         self._changed = threading.Condition()
         self._closed = self._discards = False
 
-    def put(self, call: QueuedCall) -> bool:
+    def put(self, call: QueuedCall, *, may_wait: bool = True) -> bool:
         """Add a call; False: another frame, which waited longer, was left out for it.
+
+        `may_wait` is false for the worker itself, as nobody else makes room.
 
         Raises:
             ClosedError: the queue is closed.
@@ -78,15 +80,16 @@ class EventQueue:
             self._add(call)
             return True
         with self._changed:
-            fits = not call.frame or self._queue(call)
+            fits = not call.frame or self._queue(call, may_wait)
             self._add(call)
             return fits
 
-    def _queue(self, call: QueuedCall) -> bool:
+    def _queue(self, call: QueuedCall, may_wait: bool) -> bool:
         """Add a frame to those that wait, once there is room, or for the oldest of them; False:
         that one is left out.
         """
-        while self._drop == "block" and len(self._frames) >= self._most and not self._closed:
+        waits = self._drop == "block" and may_wait
+        while waits and len(self._frames) >= self._most and not self._closed:
             self._changed.wait()
         if self._closed:
             return True
@@ -197,10 +200,12 @@ class Worker:
         Raises:
             Exception: what the worker failed with.
             ClosedError: it was closed.
+            VioError: this process is a fork of the one that made it.
         """
-        self.raise_failure()
+        self._check_usable()
+        own_thread = threading.current_thread() is self._thread
         try:
-            return self._queue.put(QueuedCall(make, frame))
+            return self._queue.put(QueuedCall(make, frame), may_wait=not own_thread)
         except ClosedError:
             self.raise_failure()  # which closed the queue meanwhile
             raise
@@ -215,7 +220,7 @@ class Worker:
         """
         if threading.current_thread() is self._thread:
             return function()
-        self.raise_failure()
+        self._check_usable()
         answer: Future[Answer] = Future()
 
         def make() -> None:
@@ -248,6 +253,15 @@ class Worker:
         if self._failure is not None:
             # else each raise would add to its traceback, for a driver that tries again and again
             raise self._failure.with_traceback(self._failed_at)
+
+    def _check_usable(self) -> None:
+        """Raise what the worker failed with, and in a forked process, which has no such thread."""
+        self.raise_failure()
+        if not self._thread.is_alive() and not self._queue.is_closed:
+            raise VioError(
+                "this odometry's thread runs in the process that made it, of which this one is a "
+                "fork; build a new one here"
+            )
 
     def end(self, *, discard: bool) -> None:
         """Make the calls that wait, or forget them, and end the thread."""

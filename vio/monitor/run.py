@@ -22,6 +22,7 @@ from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RefusalReport, RunHealth, is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import IntegrityMonitor, Mark
+from vio.monitor.view_change import ViewChange
 from vio.records import (
     Estimate,
     ImuSample,
@@ -63,6 +64,7 @@ class RunMonitor:
         """
         self._health = RunHealth()
         self._refusals = RefusalReport(imu=imu)
+        self._views = ViewChange()
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
         self._inertial: InertialCheck | None = None
@@ -345,10 +347,16 @@ class RunMonitor:
         self._add([self._health.begun_anew(index, good_ns, estimate)])
 
     def update(
-        self, index: int, report: UpdateReport, estimate: Estimate, *, has_scale: bool | None = True
+        self,
+        index: int,
+        report: UpdateReport,
+        estimate: Estimate,
+        *,
+        has_scale: bool | None = True,
+        measured: bool = True,
     ) -> None:
         """Add the back end's report and estimate of a frame; `has_scale`: whether its features or a
-        motion sensor measure lengths, None: it shows nothing.
+        motion sensor measure lengths, None: it shows nothing; `measured`: whether a sensor does.
         """
         self._integrity.take_scale(measured=has_scale)
         self._add(self._health.frame(index, report, estimate))
@@ -359,6 +367,9 @@ class RunMonitor:
             self._inertial.begin_after_jump(index)
         self._integrity.take_scale_doubt(index, report.scale_doubt)
         if self._seen is not None:
+            ratio = report.innovation_ratio
+            imu = self._refusals.imu
+            self._add(self._views.frame(self._seen, ratio, measured=measured, imu=imu))
             self._add(self._refusals.frame(self._seen, report, estimate))
         self._scale_lines += self._health.scale(index, estimate)
         if self._inertial is not None:

@@ -1,0 +1,110 @@
+"""A view that does not continue that of the frame before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.filters.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
+from vio.config import Config
+from vio.live.odometry import Odometry
+from vio.monitor.view_change import ViewChange
+from vio.records import Estimate, Observations, observations
+
+IMAGES_ALONE = replace(Config(), motion="none")
+COUNT = 100  # features of a frame
+
+
+def _frame(k: int, first: int, count: int = COUNT) -> Observations:
+    """Frame k shows the features from a number on."""
+    ids = np.arange(first, first + count)
+    return observations(k, k * STEP_NS, ids, np.ones((count, 4)))
+
+
+def _codes(
+    firsts: list[int], ratio: float | None, *, measured: bool = False, imu: bool = False
+) -> list[str]:
+    """The codes of what the last of some frames shows, which brings an innovation ratio."""
+    check = ViewChange()
+    found = []
+    for k, first in enumerate(firsts):
+        last = k == len(firsts) - 1
+        given = ratio if last else 1.0
+        found = check.frame(_frame(k, first), given, measured=measured, imu=imu)
+    return [finding.code for finding in found]
+
+
+USUAL = [0, 10, 20, 30, 40, 50]
+
+
+def test_a_view_of_which_nothing_is_left_is_named() -> None:
+    assert _codes([*USUAL, 50 + COUNT], None) == ["view-changed"]
+    assert _codes([*USUAL, 50 + COUNT], None, measured=True) == ["no-features"]
+
+
+def test_the_few_features_that_are_left_must_contradict_the_motion() -> None:
+    assert _codes([*USUAL, 130], 4.0) == ["view-changed"]  # 20 of 100
+    assert _codes([*USUAL, 130], 3.9) == []
+    assert _codes([*USUAL, 129], 4.0) == []
+
+
+def test_a_motion_sensor_has_measured_the_motion() -> None:
+    """Also where images of noise, as in the dark, seem to contradict it."""
+    assert _codes([*USUAL, 130], 4.0, measured=True) == ["no-features"]
+    assert _codes([*USUAL, 130], 40.0, measured=True, imu=True) == ["no-features"]
+
+
+def test_images_that_leave_the_imu_at_once_are_named() -> None:
+    assert _codes([*USUAL, 60], 12.0, measured=True, imu=True) == ["imu-disagrees"]
+    assert _codes([*USUAL, 60], 11.9, measured=True, imu=True) == []
+    assert _codes([*USUAL, 60], 12.0, measured=True) == []
+    assert _codes([*USUAL, 60], 12.0) == []
+
+
+def test_a_rig_whose_frames_never_share_much_has_no_other_view() -> None:
+    assert _codes([51 * k for k in range(6)] + [1000], None) == []  # 49 of 100
+    assert _codes([50 * k for k in range(6)] + [1000], None) == ["view-changed"]
+
+
+def test_five_frames_say_what_is_usual() -> None:
+    assert _codes([*USUAL[1:], 1000], None) == []
+
+
+def test_a_frame_with_few_features_shows_no_view() -> None:
+    check = ViewChange()
+    for k, first in enumerate(USUAL):
+        check.frame(_frame(k, first), 1.0, measured=False, imu=False)
+    assert check.frame(_frame(6, 1000, 29), None, measured=False, imu=False) == []
+    assert len(check.frame(_frame(7, 2000, 30), None, measured=False, imu=False)) == 1
+
+
+def _elsewhere(flight: Flight, k: int, later: int, noise: np.random.Generator) -> Observations:
+    """What the flight sees some frames later, by other features, at the time of frame k."""
+    seen = flight.observe(k + later, 0.3, noise)
+    return replace(seen, frame_index=k, time_ns=k * STEP_NS, ids=seen.ids + 10_000)
+
+
+@pytest.mark.parametrize("later", [0, 40])
+def test_the_covariance_covers_a_jump_between_joined_recordings(later: int) -> None:
+    """Images alone: the filter took the motion across the joint to be as smooth as before."""
+    flight = Flight()
+    noise = np.random.default_rng(1)
+    odometry = Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU)
+    estimates: list[Estimate] = []
+    for k in range(60):
+        seen = flight.observe(k, 0.3, noise) if k < 20 else _elsewhere(flight, k, later, noise)
+        estimate = odometry.add_observations(k * STEP_NS, seen.ids, seen.z)
+        assert estimate is not None
+        estimates.append(estimate)
+    assert [f.frame for f in odometry.findings if f.code == "view-changed"] == [20]
+    assert estimates[19].integrity == "nominal"
+    assert {e.integrity for e in estimates[20:40]} == {"unusable"}
+    after = estimates[-1]
+    assert after.integrity == "nominal"
+    first = flight.T_world_imu(0)
+    true = np.linalg.inv(first) @ flight.T_world_imu(59 + later)
+    mine = np.linalg.inv(estimates[0].T_world_imu) @ after.T_world_imu
+    sigma = np.sqrt(np.trace(after.covariance[:3, :3]))
+    assert np.linalg.norm(mine[:3, 3] - true[:3, 3]) < 3 * sigma
