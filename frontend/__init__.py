@@ -106,7 +106,9 @@ def build_frontend(
             f"{type(settings).__name__}"
         )
     if name == "auto":
-        name = "klt" if dataset is None or dataset.recording.has_images else "precomputed"
+        name = "precomputed"
+        if dataset is None or dataset.recording.has_images:
+            name = "klt"
     if name not in BUILDERS:
         raise ConfigError(
             f"frontend.name: there is no front end {name!r}; choose one of auto, "

@@ -111,7 +111,8 @@ def disc(radius: int) -> Pixels:
     read-only.
     """
     square = offsets(radius)
-    out = np.ascontiguousarray(square[:, (square**2).sum(axis=0) <= (radius + 0.5) ** 2])
+    inside = (square**2).sum(axis=0) <= (radius + 0.5) ** 2
+    out = np.ascontiguousarray(square[:, inside])
     out.flags.writeable = False
     return out
 
@@ -607,7 +608,8 @@ def template_points(warp: FloatArray, offset: FloatArray) -> FloatArray:
     """Image points (N, 2) of template points, given as offsets (N, 2) from the centre, under
     warps (N, 2, 3).
     """
-    return np.asarray(warp[:, :, 2] + (warp[:, :, :2] @ offset[:, :, None])[:, :, 0])
+    turned = (warp[:, :, :2] @ offset[:, :, None])[:, :, 0]
+    return np.asarray(warp[:, :, 2] + turned)
 
 
 def scale_change(warp: FloatArray) -> FloatArray:
@@ -615,4 +617,5 @@ def scale_change(warp: FloatArray) -> FloatArray:
     is mirrored.
     """
     A = warp[:, :, :2]
-    return np.sqrt(np.maximum(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0], 1e-6))
+    determinant = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]
+    return np.sqrt(np.maximum(determinant, 1e-6))

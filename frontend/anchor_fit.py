@@ -76,8 +76,14 @@ class AnchorFit:
         """
         camera = camera_args(self._camera)
         (height, width) = left.full.shape
-        T = np.eye(4) if motion is None else motion.T_curr_prev
-        point = old.point if motion is None else transform_points(T, old.point)
+        if motion is None:
+            T = np.eye(4)
+        else:
+            T = motion.T_curr_prev
+        if motion is None:
+            point = old.point
+        else:
+            point = transform_points(T, old.point)
         rows = np.empty(len(old), np.int64)
         start = np.empty((len(old), 2))
         scale = np.empty(len(old))

@@ -38,7 +38,9 @@ def changed(record: Record, **columns: Any) -> Record:
     time.
     """
     kept = _columns(record)
-    return type(record)(**(dict(zip(_readers[type(record)][0], kept, strict=True)) | columns))
+    kind = type(record)
+    names = _readers[kind][0]
+    return kind(**(dict(zip(names, kept, strict=True)) | columns))
 
 
 def share_of(mask: BoolArray) -> float:

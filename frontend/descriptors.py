@@ -24,10 +24,10 @@ from vio.frontend.align import (
 )
 from vio.frontend.columns import joined, take
 from vio.frontend.detect import spread_evenly
-from vio.frontend.frames import FrameValidator, Stopwatch, make_output
+from vio.frontend.frames import FrameValidator, Stopwatch, make_output, usable_prior
 from vio.frontend.outliers import MotionPriors, RansacProblem, predicted_motion, static_tracks
 from vio.frontend.patches import inside
-from vio.frontend.prediction import moved_pixels, prior_pixels, usable_prior
+from vio.frontend.prediction import moved_pixels, prior_pixels
 from vio.frontend.right_camera import most_contradict
 from vio.frontend.scene_motion import MovedPoints, SceneMotion
 from vio.frontend.settings import FrontendSettings, MatchSettings
@@ -320,7 +320,10 @@ class DescriptorFrontend:
         ]
         watch.lap("extract")
         left = extracted[0]
-        pair = self._stereo(left, extracted[1], images) if usable else _unmatched(left)
+        if usable:
+            pair = self._stereo(left, extracted[1], images)
+        else:
+            pair = _unmatched(left)
         matched = pair.has_right
         self._row_model(images[0]).update(left.pixels[matched], pair.right[matched])
         watch.lap("stereo")

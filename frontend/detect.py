@@ -41,7 +41,14 @@ _CORNERS = _CornerRules()
 # image.
 _BORDER_PX = ANCHOR_REACH_PX // 2 + 2
 # zero on planes and straight edges
-_CURVATURE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
+_CURVATURE = np.array(
+    [
+        [1, -2, 1],
+        [-2, 4, -2],
+        [1, -2, 1],
+    ],
+    dtype=np.float32,
+)
 # mean absolute value; the norm of the kernel is 6
 _CURVATURE_OF_UNIT_NOISE = 6.0 * math.sqrt(2.0 / math.pi)
 _ROUNDING_NOISE = 1.0 / math.sqrt(12.0)  # of whole gray levels
@@ -289,7 +296,8 @@ def detect_corners(
         cell[rows], cell_index(occupied, 2 * width, 2 * height, shape), shape[0] * shape[1]
     )
     order = level.argsort(kind="stable")
-    chosen = corners[rows[order[level[order] < 2 * _CORNERS.cell_features][:wanted]]]
+    best = order[level[order] < 2 * _CORNERS.cell_features]
+    chosen = corners[rows[best[:wanted]]]
     peaks = np.empty((len(chosen), 2))
     _refine_peaks(response, chosen, peaks)
     return 2.0 * peaks
@@ -324,7 +332,9 @@ def _candidates(
     if floor >= _CORNERS.min_gradient:
         return found
     weaker = local_maxima(response, occupied / 2, distance, _BORDER_PX, floor**2)
-    return weaker[np.argsort(-response[weaker[:, 1], weaker[:, 0]], kind="stable")[:missing]]
+    strength = response[weaker[:, 1], weaker[:, 0]]
+    best_first = np.argsort(-strength, kind="stable")
+    return weaker[best_first[:missing]]
 
 
 def _filling(cell: IntArray, occupied: IntArray, cells: int) -> IntArray:

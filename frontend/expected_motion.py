@@ -45,7 +45,8 @@ class ExpectedMotion:
         p = transform_points(T, p_prev)
         J = pixel_D_motion(self.camera, p).reshape(-1, 6)
         points = min(len(p), _ERRORS.independent_points)
-        fit = _ERRORS.pixel_sigma**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
+        information = points * J.T @ J / len(p) + 1e-9 * np.eye(6)
+        fit = _ERRORS.pixel_sigma**2 * np.linalg.inv(information)
         moved_m2 = float(T[:3, 3] @ T[:3, 3])
         fit[:3, :3] += _ERRORS.scale_sigma**2 * moved_m2 * np.eye(3)
         if self.disparity_error_px > 0.0:

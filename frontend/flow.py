@@ -1,5 +1,5 @@
-"""Forward-backward Lucas-Kanade at half resolution, with brightness matching; pixels are of the
-full image.
+"""Features followed by forward-backward Lucas-Kanade at half resolution, with brightness matching;
+pixels are of the full image.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.frontend.patches import ImageLevels, inside, mean_and_contrast
-from vio.frontend.tracks import ANCHOR_REACH_PX
+from vio.frontend.prediction import guessed_pixels
+from vio.frontend.tracks import ANCHOR_REACH_PX, PreviousFrame
 from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Capacity, Tolerance
-from vio.records import BoolArray, Image
+from vio.records import BoolArray, Image, TrackPrior
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +50,31 @@ class _TrackingRules(NamedTuple):
 
 
 _TRACKING = _TrackingRules()
+
+
+def follow(
+    camera: StereoCamera,
+    previous: PreviousFrame,
+    image: ImageLevels,
+    prior: TrackPrior | None,
+    expected: FloatArray,
+    levels: int,
+) -> tuple[FloatArray, BoolArray]:
+    """Return the pixels (N, 2) of the previous frame's features in the left image, and a mask (N,)
+    of those found.
+
+    Args:
+        camera: the rectified pair.
+        previous: the previous frame, N features.
+        image: the current left image.
+        prior: usable prior, or None.
+        expected: motion (4, 4) `T_curr_prev` by the last one.
+        levels: pyramid levels above half resolution.
+    """
+    old = previous.tracks
+    guess = guessed_pixels(camera, old, prior, expected, image.full)
+    trusted = prior is not None or previous.trusted
+    return track_with_retries(previous.left.half, image, old.left, guess, trusted, levels)
 
 
 def track_with_retries(
@@ -220,4 +247,5 @@ def lucas_kanade(
         minEigThreshold=_FLOW.lk_min_eigenvalue,
     )
     pixels = np.asarray(found, dtype=np.float64).reshape(-1, 2)
-    return pixels, (np.asarray(status).reshape(-1) == 1) & np.isfinite(pixels).all(axis=1)
+    is_found = np.asarray(status).reshape(-1) == 1
+    return pixels, is_found & np.isfinite(pixels).all(axis=1)

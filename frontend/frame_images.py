@@ -49,7 +49,10 @@ class ImagePreparation:
         self._right = right
         is_equalised = settings.klt.equalise == "clahe"
         self._clahe = cv2.createCLAHE(2.0, (8, 8)) if is_equalised else None
-        self._mask = None if settings.klt.mask is None else load_mask(settings.klt.mask)
+        if settings.klt.mask is None:
+            self._mask = None
+        else:
+            self._mask = load_mask(settings.klt.mask)
         self._validator = FrameValidator(camera, "klt")
         # made with the image size of the first frame
         self._setup: tuple[StereoFit, BoolArray | None] | None = None
@@ -95,7 +98,10 @@ class ImagePreparation:
         """
         if self._setup is None:
             height, width = shape
-            allowed = None if self._mask is None else half_mask(self._mask, shape)
+            if self._mask is None:
+                allowed = None
+            else:
+                allowed = half_mask(self._mask, shape)
             stereo = StereoFit(self._camera, self._disparity, self._bank, (width, height))
             self._setup = stereo, allowed
         return self._setup

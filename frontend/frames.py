@@ -1,4 +1,6 @@
-"""Parts shared by all image-based front ends: frame validation, a stopwatch, the output."""
+"""Parts shared by all image-based front ends: validation of frames and priors, a stopwatch, the
+output.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,11 @@ from vio.records import (
     Observations,
     SigmaArray,
     StereoFrame,
+    TrackPrior,
 )
+
+_I3 = np.eye(3)
+_ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
 
 
 @dataclass(slots=True)
@@ -141,6 +147,37 @@ class FrameValidator:
             )
 
 
+def _is_rotation(R: FloatArray) -> bool:
+    if not np.isfinite(R).all():
+        return False
+    return bool(np.abs(R @ R.T - _I3).max() < _ROTATION_SLACK)
+
+
+def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
+    """Return the valid part of a prior: finite left pixels, one row per id, and the rotation if
+    it is orthonormal.
+    """
+    if prior is None:
+        return None
+    ids = prior.ids
+    z = prior.z
+    if (ids[1:] <= ids[:-1]).any():
+        ids, first = np.unique(ids, return_index=True)
+        z = z[first]
+    finite = np.isfinite(z[:, :2]).all(axis=1)
+    R = prior.R_cam_prev
+    if R is not None and not _is_rotation(R):
+        R = None
+    if R is None and not finite.any():
+        return None
+    motion = prior.motion
+    if motion is not None and not (
+        np.isfinite(motion.T_curr_prev).all() and np.isfinite(motion.covariance).all()
+    ):
+        motion = None
+    return TrackPrior(ids[finite], z[finite], R, motion)
+
+
 class Features(Protocol):
     """Tracked features of any front end."""
 
@@ -182,7 +219,10 @@ def make_output(
         shown: mask (N,) of the features to output; None: all.
         sigma: (N, 3) as in `Observations`.
     """
-    rows = np.arange(len(features.ids)) if shown is None else shown.nonzero()[0]
+    if shown is None:
+        rows = np.arange(len(features.ids))
+    else:
+        rows = shown.nonzero()[0]
     z = np.empty((len(rows), 4))
     z[:, :2] = features.left[rows]
     z[:, 2:] = features.right[rows]

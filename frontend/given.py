@@ -109,7 +109,10 @@ def load_given(text: str, camera: StereoCamera, settings: FrontendSettings) -> F
     place, _, name = text.rpartition(":")
     if not place or not name.isidentifier():
         raise ConfigError(f"--frontend {text}: give FILE.py:CLASS or package.module:CLASS")
-    module = _module_of_file(Path(place)) if place.endswith(".py") else _module_named(place)
+    if place.endswith(".py"):
+        module = _module_of_file(Path(place))
+    else:
+        module = _module_named(place)
     build = getattr(module, name, None)
     if build is None:
         raise ConfigError(f"--frontend {text}: {place} has no {name}")

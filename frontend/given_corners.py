@@ -46,7 +46,8 @@ def given_corners(
     border = np.array([_BORDER_PX, _BORDER_PX])
     good = np.all((found >= border) & (found < [width, height] - border), axis=1)
     if allowed is not None:
-        column, row = np.minimum(found.astype(np.int64) // 2, np.array(allowed.shape)[::-1] - 1).T
+        last = np.array(allowed.shape)[::-1] - 1
+        column, row = np.minimum(found.astype(np.int64) // 2, last).T
         good &= allowed[row, column]
     corners = np.ascontiguousarray(found[good])
     return corners[_spread(corners, occupied, wanted, image, grid)]

@@ -9,31 +9,20 @@ from dataclasses import replace
 import numpy as np
 
 from vio.frontend.anchor_fit import AnchorFit
-from vio.frontend.flow import track_with_retries
+from vio.frontend.flow import follow
 from vio.frontend.frame_images import FrameImages, ImagePreparation
-from vio.frontend.frames import Stopwatch, make_output
+from vio.frontend.frames import Stopwatch, make_output, usable_prior
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.outliers import Consensus, RansacProblem
-from vio.frontend.prediction import guessed_pixels, usable_prior
 from vio.frontend.reappearance import is_long_gap, motion_after_gap
 from vio.frontend.right_alone import RightFollower
 from vio.frontend.right_match import RightMatcher
 from vio.frontend.settings import FrontendSettings
 from vio.frontend.static_features import StaticFeatures
-from vio.frontend.tracks import (
-    ANCHOR_RADIUS_PX,
-    INLIER_PX,
-    AnchorBank,
-    PreviousFrame,
-    Tracks,
-    no_tracks,
-)
+from vio.frontend.tracks import INLIER_PX, AnchorBank, PreviousFrame, Tracks, no_tracks
 from vio.geometry.stereo import StereoCamera
-from vio.numerics.kinds import Capacity
 from vio.protocols import Detector
 from vio.records import CheckedFrame, FrontendOutput, SigmaArray, StereoFrame, TrackPrior
-
-_BANK_FACTOR: Capacity[int] = 3  # templates allocated, over the number of features
 
 
 class KltFrontend:
@@ -58,7 +47,7 @@ class KltFrontend:
         self._camera = camera
         self._levels = settings.klt.pyramid_levels
         self._seed = settings.consensus.seed
-        self._bank = AnchorBank(_BANK_FACTOR * settings.grid.target_features, ANCHOR_RADIUS_PX)
+        self._bank = AnchorBank.for_features(settings.grid.target_features)
         self._matcher = RightMatcher(camera)
         self._right = self._matcher.images
         self._prepare = ImagePreparation(camera, settings, self._bank, self._right)
@@ -148,11 +137,7 @@ class KltFrontend:
                 prior = None
             elif prior is None:
                 return no_tracks(), None
-        guess = guessed_pixels(self._camera, old, prior, expected, left.full)
-        trusted = prior is not None or previous.trusted
-        found, seen = track_with_retries(
-            previous.left.half, left, old.left, guess, trusted, self._levels
-        )
+        found, seen = follow(self._camera, previous, left, prior, expected, self._levels)
         watch.lap("track")
         problem = self._problem(frame.index, INLIER_PX)
         seen, motion = self._static.select(problem, old, found, seen, prior, expected, images)
@@ -175,8 +160,14 @@ class KltFrontend:
         right = images.right
         self._bank.keep_only(tracks.slot)
         before = self._previous
-        self._step_ns = None if before is None else time_ns - before.time_ns
-        twist = np.zeros(6) if before is None else before.twist_per_s
+        if before is None:
+            self._step_ns = None
+        else:
+            self._step_ns = time_ns - before.time_ns
+        if before is None:
+            twist = np.zeros(6)
+        else:
+            twist = before.twist_per_s
         if before is not None and motion is not None:
             twist = before.twist_until(time_ns, motion.T_curr_prev)
         right_half = None if right is None else right.half

@@ -241,7 +241,9 @@ def _freed_of_slow_object(case: _Case, first: _First) -> TwoMotions | None:
     slow = _without_slow_object(
         case.problem, case.p_prev, case.pixels, case.found, case.expected, case.voting
     )
-    return None if slow is None else TwoMotions(slow, case.without(slow.inliers), "predicted")
+    if slow is None:
+        return None
+    return TwoMotions(slow, case.without(slow.inliers), "predicted")
 
 
 def _second_motion(case: _Case, first: _First) -> _Second:
@@ -254,7 +256,9 @@ def _second_motion(case: _Case, first: _First) -> _Second:
         starts = np.stack([np.eye(4) if prior is None else prior.T_curr_prev, np.eye(4)])
         T, support = best_motion(case.problem, case.p_prev[others], case.pixels[others], starts)
     exists = bool(support.sum() >= case.min_support)
-    object_share = _if_large(support.sum() / len(case.p_prev)) if exists else 0.0
+    object_share = 0.0
+    if exists:
+        object_share = _if_large(support.sum() / len(case.p_prev))
     # the prediction is that of a body that goes on as before
     if case.expected is not None and first.contradicted and not case.measured:
         near = _near_prediction(case.problem, case.p_prev, case.pixels, case.found, case.expected)
@@ -262,7 +266,10 @@ def _second_motion(case: _Case, first: _First) -> _Second:
             T = near.T_curr_prev
             support = near.inliers[others]
             exists = True
-    follows = case.followers(T) if exists else np.zeros(len(case.p_prev), dtype=np.bool_)
+    if exists:
+        follows = case.followers(T)
+    else:
+        follows = np.zeros(len(case.p_prev), dtype=np.bool_)
     return _Second(T, support, follows, exists, object_share)
 
 
@@ -395,7 +402,9 @@ def _without_slow_object(
         return None
     if (moving & voting).sum() > (1.0 - _VOTE.clear_share) * voting.sum():
         return None
-    return Consensus(T, follows) if expected.distance(T, p_prev[old]) <= AGREEMENT_LIMIT else None
+    if expected.distance(T, p_prev[old]) <= AGREEMENT_LIMIT:
+        return Consensus(T, follows)
+    return None
 
 
 def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] | None:
@@ -494,13 +503,16 @@ def _agree_with(
     across = np.cross(seen, T[:3, 3])
     off = np.cross(seen, turned)
     inverse = -np.sum(across * off, axis=1) / (np.sum(across * across, axis=1) + 1e-12)
-    p = turned / np.clip(inverse, 1.0 / _AGREEMENT.far_m, 1.0 / near_m)[:, None] + T[:3, 3]
+    inverse_depth = np.clip(inverse, 1.0 / _AGREEMENT.far_m, 1.0 / near_m)
+    p = turned / inverse_depth[:, None] + T[:3, 3]
     ahead = depth_of(camera, p) > 0.0
     p[~ahead] = [0.0, 0.0, 1.0]
     J = pixel_D_motion(camera, p)
-    S = J @ predicted.covariance @ J.transpose(0, 2, 1) + sigma_px**2 * np.eye(2)
+    by_motion = J @ predicted.covariance @ J.transpose(0, 2, 1)
+    S = by_motion + sigma_px**2 * np.eye(2)
     d = after - project(camera, p)[:, :2]
-    squared = np.sum(d * np.linalg.solve(S, d[..., None])[..., 0], axis=1)
+    whitened = np.linalg.solve(S, d[..., None])[..., 0]
+    squared = np.sum(d * whitened, axis=1)
     return np.asarray(ahead & (squared <= float(chi_square_quantile(AGREEMENT_PROBABILITY, 1))))
 
 

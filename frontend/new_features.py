@@ -97,7 +97,9 @@ class NewFeatures:
         target = self._grid.target_features
         missing = target - active
         self._rested = not self._rested and missing <= _NEW.few_missing_share * target
-        return 0 if self._rested else round(missing * (1.0 + _NEW.spare_corners))
+        if self._rested:
+            return 0
+        return round(missing * (1.0 + _NEW.spare_corners))
 
     def add(
         self,
@@ -138,7 +140,8 @@ class NewFeatures:
         new = changed(new, left_only_frames=np.where(new.has_right, 0, 1))
         room = max(0, self._grid.target_features - len(tracks))
         good = (new.has_right | (len(chosen) > with_depth)).nonzero()[0]
-        return joined(tracks, take(new, good[(~new.has_right[good]).argsort(kind="stable")][:room]))
+        matched_first = (~new.has_right[good]).argsort(kind="stable")
+        return joined(tracks, take(new, good[matched_first][:room]))
 
     def output(self, tracks: Tracks) -> Tracks:
         """Output features that passed their probation from now on, under new ids; all features
@@ -239,5 +242,6 @@ class NewFeatures:
         depth = self._camera.fu * self._camera.baseline_m / np.maximum(disparity, 0.1)
         moved = transform_points(T, left_rays(self._camera, corners) * depth[:, None])
         ahead = depth_of(self._camera, moved) > 0.5
-        pixels = project(self._camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
+        safe = np.where(ahead[:, None], moved, [0.0, 0.0, 1.0])
+        pixels = project(self._camera, safe)[:, :2]
         return np.asarray(ahead & inside(image, pixels, 0.0))

@@ -60,14 +60,20 @@ def disparities(
     height, width = depth_m.shape
     u = pixels[:, 0]
     v = pixels[:, 1]
-    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    in_columns = (u >= 0) & (u <= width - 1)
+    in_rows = (v >= 0) & (v <= height - 1)
+    inside = in_columns & in_rows
     x = np.clip(np.floor(np.where(inside, u, 0.0)), 0, width - 2).astype(np.int64)
     y = np.clip(np.floor(np.where(inside, v, 0.0)), 0, height - 2).astype(np.int64)
-    corners = np.stack([depth_m[y, x], depth_m[y, x + 1], depth_m[y + 1, x], depth_m[y + 1, x + 1]])
+    right = x + 1
+    below = y + 1
+    corners = np.stack([depth_m[y, x], depth_m[y, right], depth_m[below, x], depth_m[below, right]])
     has_depth = inside & np.all(np.isfinite(corners) & (corners > _MIN_DEPTH_M), axis=0)
     d = camera.fu * camera.baseline_m / np.where(has_depth, corners, 1.0)
     a = u - x
     b = v - y
-    out = (1 - b) * ((1 - a) * d[0] + a * d[1]) + b * ((1 - a) * d[2] + a * d[3])
+    upper = (1 - a) * d[0] + a * d[1]
+    lower = (1 - a) * d[2] + a * d[3]
+    out = (1 - b) * upper + b * lower
     known: BoolArray = has_depth & (np.ptp(d, axis=0) <= _MAX_SLOPE_PX)
     return np.where(known, out, 0.0), known

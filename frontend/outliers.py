@@ -534,7 +534,8 @@ def _motions_agree(
 
 def _rotation_difference_deg(T: FloatArray, R: FloatArray) -> float:
     """Angle between the rotation of a motion (4, 4) and a predicted rotation (3, 3)."""
-    return float(np.degrees(np.linalg.norm(so3_log(T[:3, :3] @ R.T))))
+    turn_rad = np.linalg.norm(so3_log(T[:3, :3] @ R.T))
+    return float(np.degrees(turn_rad))
 
 
 def epipolar_distance(
@@ -621,7 +622,9 @@ def predicted_motion(
     T = _refine(
         camera, T, p, z, _CONSENSUS.prior_px, slice(0, 6), converged=_CONSENSUS.prior_converged
     )
-    return T if median(pixel_errors(camera, T, p, z)) <= _CONSENSUS.prior_px else None
+    if median(pixel_errors(camera, T, p, z)) <= _CONSENSUS.prior_px:
+        return T
+    return None
 
 
 # --- two views, no depth
@@ -720,7 +723,8 @@ def _ray_distance(
 
 def _bearing_inliers(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> BoolArray:
     """Mask (N,) of the inliers of a motion (4, 4)."""
-    return np.asarray(_ray_distance(problem.camera, seen, T[:3, :3], T[:3, 3]) <= problem.limit_px)
+    distance_px = _ray_distance(problem.camera, seen, T[:3, :3], T[:3, 3])
+    return np.asarray(distance_px <= problem.limit_px)
 
 
 def _cost(problem: RansacProblem, seen: _TwoViews, R: FloatArray, t: FloatArray) -> FloatArray:
@@ -757,7 +761,8 @@ def _bearing_ransac(
             se3_from_parts(np.broadcast_to(R, (len(t), 3, 3)), sign * t) for sign in (1.0, -1.0)
         ]
     T = np.concatenate(models)
-    best = T[int(np.argmin(_cost(problem, seen, T[:, :3, :3], T[:, :3, 3])))]
+    cost = _cost(problem, seen, T[:, :3, :3], T[:, :3, 3])
+    best = T[int(np.argmin(cost))]
     for _ in range(_RANSAC.max_refine_steps):
         better = _bearing_step(problem, seen, best)
         if _cost(problem, seen, better[:3, :3], better[:3, 3]) >= _cost(
@@ -779,7 +784,8 @@ def _bearing_step(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> Flo
     turned = seen.before @ R.T
     line = np.cross(t, turned)
     normal = facing(camera, seen.after, line)[1]
-    scale = np.hypot(normal[:, 0] / camera.fu, normal[:, 1] / camera.fv) + _CONSENSUS.epsilon
+    length = np.hypot(normal[:, 0] / camera.fu, normal[:, 1] / camera.fv)
+    scale = length + _CONSENSUS.epsilon
     distance = _ray_distance(camera, seen, R, t)
     weight = (
         np.where(
@@ -808,12 +814,14 @@ def _pure_rotation(problem: RansacProblem, seen: _TwoViews) -> FloatArray:
     pairs = _pairs(len(f), problem)
     R = _triads(g, pairs) @ np.swapaxes(_triads(f, pairs), 1, 2)
     still = np.zeros(3)
-    R_best = R[int(np.argmin(_cost(problem, seen, R, np.broadcast_to(still, (len(R), 3)))))]
+    cost = _cost(problem, seen, R, np.broadcast_to(still, (len(R), 3)))
+    R_best = R[int(np.argmin(cost))]
     near = _ray_distance(problem.camera, seen, R_best, still) <= problem.limit_px
     # Reference: Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst.
     # (1976).
     U, _, Vt = np.linalg.svd(g[near].T @ f[near])
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+    handedness = np.linalg.det(U @ Vt)
+    return np.asarray(U @ np.diag([1.0, 1.0, handedness]) @ Vt)
 
 
 def _pairs(count: int, problem: RansacProblem) -> IntArray:
@@ -847,13 +855,13 @@ def _five_point(
         previous, current = _pinhole_pixels(camera, previous, current)
         if len(current) < _RANSAC.min_points:
             return None
-    K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
     params = cv2.UsacParams()
     params.confidence = _CONSENSUS.five_point_confidence
     params.threshold = problem.limit_px
     params.maxIterations = 10 * _RANSAC.samples
     params.randomGeneratorState = int(problem.rng.integers(0, 2**31 - 1))
     params.isParallel = False
+    K = camera.K
     none = np.zeros(4)
     essential, _ = cv2.findEssentialMat(previous, current, K, K, none, none, params)
     if essential is None or len(essential) < 3 or not np.isfinite(essential).all():

@@ -39,7 +39,9 @@ def inside(image: Image, points: npt.NDArray[np.float64], margin: float) -> Bool
     height, width = image.shape
     u = points[:, 0]
     v = points[:, 1]
-    return (u >= margin) & (u <= width - 1 - margin) & (v >= margin) & (v <= height - 1 - margin)
+    in_columns = (u >= margin) & (u <= width - 1 - margin)
+    in_rows = (v >= margin) & (v <= height - 1 - margin)
+    return in_columns & in_rows
 
 
 def mean_and_contrast(image: Image, stride: int) -> tuple[float, float]:

@@ -15,40 +15,9 @@ from vio.numerics.compiled import compiled, index_of
 from vio.numerics.kinds import Tolerance
 from vio.records import BoolArray, Image, IntArray, TrackPrior
 
-_I3 = np.eye(3)
-_ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
 _MIN_DEPTH_M = 0.1
 _NEIGHBOURS = 3  # matched features whose median depth replaces an unknown one
 _FAR_M: Tolerance[float] = 1e6  # depth assumed where too few features have one
-
-
-def _is_rotation(R: FloatArray) -> bool:
-    return bool(np.isfinite(R).all() and np.abs(R @ R.T - _I3).max() < _ROTATION_SLACK)
-
-
-def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
-    """Return the valid part of a prior: finite left pixels, one row per id, and the rotation if
-    it is orthonormal.
-    """
-    if prior is None:
-        return None
-    ids = prior.ids
-    z = prior.z
-    if (ids[1:] <= ids[:-1]).any():
-        ids, first = np.unique(ids, return_index=True)
-        z = z[first]
-    finite = np.isfinite(z[:, :2]).all(axis=1)
-    R = prior.R_cam_prev
-    if R is not None and not _is_rotation(R):
-        R = None
-    if R is None and not finite.any():
-        return None
-    motion = prior.motion
-    if motion is not None and not (
-        np.isfinite(motion.T_curr_prev).all() and np.isfinite(motion.covariance).all()
-    ):
-        motion = None
-    return TrackPrior(ids[finite], z[finite], R, motion)
 
 
 def prior_pixels(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:

@@ -84,7 +84,9 @@ def motion_after_gap(
         return None
     starts = np.stack([expected, np.eye(4)])
     T = motion_across(problem, images.stereo, previous, images.left, images.right, starts)
-    return None if T is None or (prior is not None and contradicts_gyro(T, prior.motion)) else T
+    if T is None or (prior is not None and contradicts_gyro(T, prior.motion)):
+        return None
+    return T
 
 
 def contradicts_gyro(T_curr_prev: FloatArray, predicted: MotionPrior | None) -> bool:

@@ -140,7 +140,8 @@ class RightAlone:
         warp[:, :, 2] = start
         warp, score = align(bank.store, old.slot[rows], right.full, warp, ITERATIONS)
         good: BoolArray = (score >= MIN_CORRELATION) & on_peak(warp[:, :, 2], start)
-        good &= pixel_errors(camera, T, old.point[rows], warp[:, :, 2]) <= problem.limit_px
+        errors_px = pixel_errors(camera, T, old.point[rows], warp[:, :, 2])
+        good &= errors_px <= problem.limit_px
         if good.sum() < _MIN_POINTS:
             return None
         tracks = replace(take(old, rows), left=warp[:, :, 2].copy(), point=point, warp=warp)

@@ -149,7 +149,10 @@ class RightCamera(Finder):
         """Use right images again once they agree, or were not tested, for so many frames; report
         those that contradict for so many.
         """
-        self._untested = 0 if tested or agrees else self._untested + 1
+        if tested or agrees:
+            self._untested = 0
+        else:
+            self._untested = self._untested + 1
         self._agreeing = self._agreeing + 1 if agrees else 0
         self._count += not agrees
         if self._agreeing >= _CONTRADICTION.frames or self._untested >= _CONTRADICTION.blind_frames:

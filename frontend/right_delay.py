@@ -289,4 +289,6 @@ def at_present(
 def _rounded(delay: float) -> float:
     """Return a delay in frames, a whole number where it is close to one."""
     whole = float(np.rint(delay))
-    return whole if abs(delay - whole) < _DELAY.whole_slack_frames else delay
+    if abs(delay - whole) < _DELAY.whole_slack_frames:
+        return whole
+    return delay

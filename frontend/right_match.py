@@ -107,7 +107,8 @@ class RightMatcher:
             return tracks
         self._rows_off = None
         seen = matched.has_right
-        rows = matched.right[seen, 1] - matched.left[seen, 1] - delay * flow[seen, 1]
+        disparity_v = matched.right[seen, 1] - matched.left[seen, 1]
+        rows = disparity_v - delay * flow[seen, 1]
         if self._delay.update(frame.index, matched.left[seen], flow[seen], rows, frame_s):
             stereo.restart_rows()
             return no_tracks()  # their depths are those of images of different times
@@ -243,4 +244,6 @@ def _motion_between(prior: TrackPrior | None, motion: Consensus | None) -> Float
     """Return the motion (4, 4) by the images, else as predicted, else none."""
     if motion is not None:
         return motion.T_curr_prev
-    return np.eye(4) if prior is None or prior.motion is None else prior.motion.T_curr_prev
+    if prior is None or prior.motion is None:
+        return np.eye(4)
+    return prior.motion.T_curr_prev

@@ -41,7 +41,9 @@ class SceneChoice:
     @property
     def static(self) -> BoolArray:
         """Which points (N,) may be used."""
-        return np.zeros_like(self.motion.inliers) if self.hidden else self.motion.inliers
+        if self.hidden:
+            return np.zeros_like(self.motion.inliers)
+        return self.motion.inliers
 
 
 class SceneMotion:

@@ -9,11 +9,13 @@ from vio.frontend.align import INSIDE, cut_patches, empty_templates, replace_tem
 from vio.frontend.columns import joined
 from vio.frontend.patches import ImageLevels
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
+from vio.numerics.kinds import Capacity
 from vio.records import BoolArray, Image, IntArray, SigmaArray
 
 ANCHOR_RADIUS_PX = 9  # of the anchor patch that a feature is aligned with
 # at least so far from the image's border features stay
 ANCHOR_REACH_PX = round(INSIDE * ANCHOR_RADIUS_PX)
+_BANK_FACTOR: Capacity[int] = 3  # templates allocated, over the number of features
 INLIER_PX = 1.0  # largest reprojection error of a static feature under the consensus motion
 
 
@@ -91,6 +93,11 @@ class AnchorBank:
         self.store = empty_templates(count, radius_px)
         self._radius_px = radius_px
         self._taken = np.zeros(count, dtype=np.bool_)
+
+    @classmethod
+    def for_features(cls, count: int) -> AnchorBank:
+        """Return a bank with room for the anchors of so many features at a time."""
+        return cls(_BANK_FACTOR * count, ANCHOR_RADIUS_PX)
 
     def add(self, image: Image, centres: FloatArray) -> IntArray:
         """Cut new anchors around pixels (N, 2) of an image; return their slots (N,)."""

@@ -278,7 +278,9 @@ def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
             yield from describe(value, f"{prefix}{f.name}.")
         else:
             hint = hints[f.name]
-            choices = tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else ()
+            choices: tuple[str, ...] = ()
+            if get_origin(hint) is Literal:
+                choices = tuple(map(str, get_args(hint)))
             unit = f.metadata.get("unit", "")
             doc = f.metadata.get("doc", "")
             allowed = str(f.metadata.get("range", Range()))
@@ -331,7 +333,9 @@ def _converted(value: Any, hint: Any) -> Any:
     if isinstance(value, bool):  # which Python takes for a whole number
         return value if hint is bool else None
     if hint is float and isinstance(value, int):
-        return float(value) if abs(value) < 2**1000 else math.inf  # which no range allows
+        if abs(value) < 2**1000:
+            return float(value)
+        return math.inf  # which no range allows
     if hint is Path and isinstance(value, str):
         return Path(value)
     return value
@@ -399,4 +403,6 @@ def _plain(value: Any) -> Any:
 def _short(value: Any) -> str:
     """Return a value for a message, cut where it is long."""
     text = value if isinstance(value, str) else repr(value)
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}…"
+    if len(text) <= _MAX_SHOWN:
+        return text
+    return f"{text[:_MAX_SHOWN]}…"

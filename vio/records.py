@@ -270,7 +270,10 @@ def observations(
             if has_right is None
             else np.asarray(has_right, dtype=np.bool_)
         )
-        old = np.zeros(n, dtype=np.bool_) if stale is None else np.asarray(stale, dtype=np.bool_)
+        if stale is None:
+            old = np.zeros(n, dtype=np.bool_)
+        else:
+            old = np.asarray(stale, dtype=np.bool_)
         index = int(frame_index)
         stamp_ns = int(time_ns)
     except (ValueError, TypeError, OverflowError) as error:
@@ -319,12 +322,15 @@ def feature_tracks(seen: Mapping[int, Observations], frames: int) -> FeatureTrac
     for k, shown in seen.items():
         counts[k + 1] = len(shown)
     parts = [seen[k] for k in sorted(seen)]
+    no_ids = np.zeros(0, dtype=np.int64)
+    no_pixels = np.zeros((0, 4))
+    no_marks = np.zeros(0, dtype=np.bool_)
     return FeatureTracks(
         np.cumsum(counts),
-        np.concatenate([np.zeros(0, dtype=np.int64), *(o.ids for o in parts)]),
-        np.concatenate([np.zeros((0, 4)), *(o.z for o in parts)]),
-        np.concatenate([np.zeros(0, dtype=np.bool_), *(o.has_right for o in parts)]),
-        np.concatenate([np.zeros(0, dtype=np.bool_), *(o.stale for o in parts)]),
+        np.concatenate([no_ids, *(o.ids for o in parts)]),
+        np.concatenate([no_pixels, *(o.z for o in parts)]),
+        np.concatenate([no_marks, *(o.has_right for o in parts)]),
+        np.concatenate([no_marks, *(o.stale for o in parts)]),
         joined_sigmas(parts),
     )
 
@@ -352,7 +358,9 @@ class TrackPrior:
     @property
     def measured_motion(self) -> MotionPrior | None:
         """The motion, if a sensor has measured it."""
-        return self.motion if self.motion is not None and self.motion.measured else None
+        if self.motion is not None and self.motion.measured:
+            return self.motion
+        return None
 
 
 @dataclass(frozen=True, slots=True)

@@ -135,4 +135,6 @@ def _check(key: str, value: Any, allowed: Range) -> None:
 
 
 def _number(value: float) -> str:
-    return f"{value:g}" if isinstance(value, float) or abs(value) < 2**1000 else "a larger number"
+    if isinstance(value, float) or abs(value) < 2**1000:
+        return f"{value:g}"
+    return "a larger number"

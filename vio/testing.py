@@ -179,27 +179,37 @@ def _report(errors: FrontendErrors) -> FrontendReport:
     good_step, good_right = (
         part[np.linalg.norm(part, axis=1) <= _CORRECT_PX] for part in (step, right)
     )
+    wrong = 0.0
+    if len(step):
+        wrong = 1 - len(good_step) / len(step)
+    wrong_matches = 0.0
+    if len(right):
+        wrong_matches = 1 - len(good_right) / len(right)
     return FrontendReport(
         frames=len(errors.features),
         features=float(np.median(errors.features)),
         matched=float(np.median(errors.matched)),
         survival=errors.followed / max(errors.visible, 1),
-        wrong=1 - len(good_step) / len(step) if len(step) else 0.0,
+        wrong=wrong,
         step_error_px=_median(np.linalg.norm(good_step, axis=1)),
         step_bias_px=(_median(good_step[:, 0]), _median(good_step[:, 1])),
         disparity_error_px=_median(np.abs(good_right[:, 0])),
         disparity_bias_px=_median(-good_right[:, 0]),
-        wrong_matches=1 - len(good_right) / len(right) if len(right) else 0.0,
+        wrong_matches=wrong_matches,
         row_error_px=_median(np.abs(good_right[:, 1])),
         reused_ids=errors.reused,
     )
 
 
 def _median(values: FloatArray) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
+    if len(values):
+        return float(np.median(values))
+    return float("nan")
 
 
 def _shown(value: object) -> str:
     if isinstance(value, tuple):
         return " ".join(f"{part:.4f}" for part in value)
-    return f"{value:.4f}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.4f}"
+    return str(value)

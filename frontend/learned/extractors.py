@@ -150,7 +150,8 @@ def _keypoints(pixels: Tensor, descriptors: Tensor, strength: Tensor) -> Keypoin
     )
     uv, described, weight = columns
     order = np.argsort(-weight, kind="stable")
-    order = order[np.isfinite(described[order]).all(axis=1) & np.isfinite(uv[order]).all(axis=1)]
+    finite = np.isfinite(described[order]).all(axis=1) & np.isfinite(uv[order]).all(axis=1)
+    order = order[finite]
     norm = np.maximum(np.linalg.norm(described[order], axis=1, keepdims=True), 1e-9)
     return Keypoints(uv[order].astype(np.float64), (described[order] / norm).astype(np.float32))
 
@@ -202,7 +203,10 @@ class _Whole:
 
         # Calls of the network's kernels take longer than the kernels on a GPU, so that all images
         # share them.
-        batches = [images] if self.device.type == "cuda" else [(image,) for image in images]
+        if self.device.type == "cuda":
+            batches = [images]
+        else:
+            batches = [(image,) for image in images]
         with torch.inference_mode(), half_precision(self.device):
             return [_keypoints(*columns) for batch in batches for columns in self._found(batch)]
 
@@ -283,7 +287,8 @@ class _Corners:
 
         def offset(before: Tensor, after: Tensor) -> Tensor:
             bend = before - 2 * middle + after
-            return torch.clamp((before - after) / 2 / torch.where(bend < 0, bend, -1.0), -0.5, 0.5)
+            divisor = torch.where(bend < 0, bend, -1.0)
+            return torch.clamp((before - after) / 2 / divisor, -0.5, 0.5)
 
         du = offset(response[rows, columns - 1], response[rows, columns + 1])
         dv = offset(response[rows - 1, columns], response[rows + 1, columns])

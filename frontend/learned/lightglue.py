@@ -45,7 +45,10 @@ class _LightGlueMatcher:
             described = torch.from_numpy(points.descriptors.astype(np.float32))[None].to(
                 self.device
             )
-            size = self.size if self.size is not None else tuple(points.pixels.max(axis=0))
+            if self.size is not None:
+                size = self.size
+            else:
+                size = tuple(points.pixels.max(axis=0))
             return {
                 "keypoints": uv,
                 "descriptors": described,
@@ -107,5 +110,8 @@ def build_lightglue(
             "for "
             f"{learned.detector}: {min(missing)}; give the file that belongs to it"
         )
-    size = None if camera.width is None or camera.height is None else (camera.width, camera.height)
+    if camera.width is None or camera.height is None:
+        size = None
+    else:
+        size = (camera.width, camera.height)
     return _LightGlueMatcher(network.eval().to(device), size, device)

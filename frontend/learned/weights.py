@@ -84,7 +84,9 @@ def filled(module: Any, path: Path | None, setting: str) -> Module:
             k for k in module.state_dict() if k.endswith("running_var")
         }
         wrong = sorted(set(result.missing_keys) & learned) + sorted(result.unexpected_keys)
-        problem = f"{len(wrong)} entries do not fit, such as {wrong[0]}" if wrong else None
+        problem = None
+        if wrong:
+            problem = f"{len(wrong)} entries do not fit, such as {wrong[0]}"
     except (RuntimeError, TypeError, AttributeError) as error:
         problem = " ".join(str(error).split())[:140]
     if problem is not None:

@@ -13,8 +13,8 @@ import pytest
 from tests.frontend.test_frontend_outliers import CAMERA, T_TRUE, make_problem, pixels, scene
 from tools.frontend_accuracy import accuracy_scenario
 from vio.frontend import FrontendSettings, build_frontend, descriptors, outliers
+from vio.frontend.frames import usable_prior
 from vio.frontend.outliers import pixel_errors, predicted_motion, rigid_consensus
-from vio.frontend.prediction import usable_prior
 from vio.frontend.settings import GridSettings, MatchSettings
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse

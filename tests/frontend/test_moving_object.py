@@ -19,6 +19,7 @@ from tests.frontend.test_frontend_outliers import (
 )
 from tests.guards import lines_of
 from vio.frontend.frame_images import FrameImages
+from vio.frontend.frames import usable_prior
 from vio.frontend.moving_object import (
     TwoMotions,
     choose_motion,
@@ -29,7 +30,6 @@ from vio.frontend.moving_object import (
 from vio.frontend.object_report import ObjectReport
 from vio.frontend.outliers import Consensus, pixel_errors, rigid_consensus
 from vio.frontend.patches import ImageLevels
-from vio.frontend.prediction import usable_prior
 from vio.frontend.right_images import RightImages
 from vio.frontend.settings import DisparitySettings
 from vio.frontend.static_features import StaticFeatures

@@ -10,9 +10,9 @@ import pytest
 from tests.frontend.test_frontend_scene import CAMERA
 from vio.frontend.columns import changed
 from vio.frontend.detect import detect_corners, grid_shape, min_distance_px
+from vio.frontend.frames import usable_prior
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.outliers import Consensus
-from vio.frontend.prediction import usable_prior
 from vio.frontend.settings import GridSettings
 from vio.frontend.tracks import AnchorBank, Tracks, new_tracks
 from vio.geometry.lie import se3_exp

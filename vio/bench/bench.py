@@ -188,7 +188,9 @@ def _write_trajectories(
     """Write the poses of each run that has some, in TUM's form."""
     folder.mkdir(exist_ok=True)
     for task in tasks:
-        poses = (store.get(task.key) or {}).get("trajectory") if task.key in records else None
+        poses = None
+        if task.key in records:
+            poses = (store.get(task.key) or {}).get("trajectory")
         if poses is not None:
             atomic_write_text(
                 folder / f"{task.sequence}.{task.system}.{task.seed}.tum",
@@ -244,7 +246,10 @@ def _write(
 
 
 def _outcome(task: Task, records: Mapping[str, Record], success_percent: float) -> Outcome:
-    record = records.get(task.key) if task.failure is None else failed(task.failure, keep=False)
+    if task.failure is None:
+        record = records.get(task.key)
+    else:
+        record = failed(task.failure, keep=False)
     if record is None:
         record = failed("it was not done", keep=False)
     return Outcome(

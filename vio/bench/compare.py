@@ -216,11 +216,18 @@ def compare_outcomes(
     changes = list[Change]()
     for names in ((_PRIMARY.name,), _JUDGED[1:], _NOT_JUDGED):
         changes += _tested(pairs, systems, names, drawn_each_seed, margin)
+    fails_now = []
+    failed_before = []
+    for old, new in pairs:
+        if _fails_first(new, old):
+            fails_now.append((old.sequence, old.system, new.failure or ""))
+        if _fails_first(old, new):
+            failed_before.append((old.sequence, old.system))
     return Comparison(
         tuple(sorted(changes, key=lambda c: systems.index(c.system))),
         tuple(_sequence_changes(pairs, systems, factor)),
-        tuple((o.sequence, o.system, n.failure or "") for o, n in pairs if _fails_first(n, o)),
-        tuple((o.sequence, o.system) for o, n in pairs if _fails_first(o, n)),
+        tuple(fails_now),
+        tuple(failed_before),
         len(before) + len(after) - 2 * len(pairs),
         margin,
     )
@@ -295,9 +302,14 @@ def _cases(
         x = old.value(metric)
         y = new.value(metric)
         if x is not None and y is not None:
-            case = (old.sequence, old.seed) if old.sequence in drawn_each_seed else old.sequence
+            case: Any = old.sequence
+            if old.sequence in drawn_each_seed:
+                case = (old.sequence, old.seed)
             found.setdefault(case, set()).add((max(x, FLOOR), max(y, FLOOR)))
-    return {case: [math.log(y / x) for x, y in sorted(values)] for case, values in found.items()}
+    logs = {}
+    for case, values in found.items():
+        logs[case] = [math.log(y / x) for x, y in sorted(values)]
+    return logs
 
 
 def effect_of(logs: npt.ArrayLike, metric: Metric = _PRIMARY) -> Effect:
@@ -349,7 +361,8 @@ def _sequence_changes(
     seeds says.
     """
     tested = list(_effects_on_primary(pairs, systems))
-    for (system, name, effect), p in zip(tested, holm([e.p for _, _, e in tested]), strict=True):
+    adjusted = holm([effect.p for _, _, effect in tested])
+    for (system, name, effect), p in zip(tested, adjusted, strict=True):
         if abs(math.log(effect.ratio)) <= math.log(factor):
             continue
         both = [pair for pair in pairs if (pair[0].sequence, pair[0].system) == (name, system)]
@@ -381,13 +394,19 @@ def comparison_lines(result: Comparison) -> Iterator[str]:
     was lost.
     """
     titles = {metric.name: metric.title for metric in METRICS}
-    width = max(16, *(len(c.system) for c in result.changes)) if result.changes else 16
+    width = 16
+    if result.changes:
+        width = max(16, *(len(c.system) for c in result.changes))
     head = f"{'configuration':<{width}} {'figure':<14} {'B / A':>8}  {'95 % interval':<18} "
     yield f"{head} {'n':>3} {'p (Holm)':>9}  verdict"
     for c in result.changes:
-        verdict = c.verdict if c.is_judged else f"({c.verdict}, not judged)"
-        head = f"{c.system:<{width}} {titles[c.metric]:<14} {number(c.effect.ratio, 4):>8}"
-        yield f"{head}  {_interval(c.effect):<18} {c.effect.n:>3} {c.p_adjusted:>9.4f}  {verdict}"
+        verdict: str = c.verdict
+        if not c.is_judged:
+            verdict = f"({verdict}, not judged)"
+        ratio = number(c.effect.ratio, 4)
+        interval = _interval(c.effect)
+        head = f"{c.system:<{width}} {titles[c.metric]:<14} {ratio:>8}"
+        yield f"{head}  {interval:<18} {c.effect.n:>3} {c.p_adjusted:>9.4f}  {verdict}"
     for s in result.sequences:
         values = f"ATE {number(s.before, 3)} to {number(s.after, 3)} m"
         by = f"B / A {number(s.effect.ratio, 3)}, {_interval(s.effect)} over n = {s.effect.n} different seeds"

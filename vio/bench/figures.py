@@ -105,7 +105,10 @@ def pose_nees(
         if len(rows):
             a = T[rows[0]]
             b = truth[rows[0]]
-            first = yaw_and_position(a, b) if upright[rows[0]] else a @ se3_inverse(b)
+            if upright[rows[0]]:
+                first = yaw_and_position(a, b)
+            else:
+                first = a @ se3_inverse(b)
             world = first if T_world_true is None else T_world_true
             errors[rows] = se3_log(se3_inverse(world @ truth[rows]) @ T[rows])
     invertible = np.linalg.cond(P) < _MAX_CONDITION
@@ -179,7 +182,8 @@ def error_curve(evaluation: Evaluation, times_ns: IntArray | None) -> dict[str, 
     seconds = (
         rows.astype(float) if times_ns is None else (times_ns[rows] - times_ns[rows[0]]) / NS_PER_S
     )
-    picked = np.unique(np.linspace(0, len(rows) - 1, min(_CURVE, len(rows))).round().astype(int))
+    count = min(_CURVE, len(rows))
+    picked = np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))
     return {
         "seconds": _rounded(seconds[picked], 3),
         "error_m": _rounded(evaluation.errors_m[picked], 6),
@@ -195,11 +199,14 @@ def between(trajectory: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
         trajectory.times_ns <= last_ns + _FRAME_NS
     )
     indices = trajectory.frame_indices
+    frame_indices = None
+    if indices is not None:
+        frame_indices = indices[inside]
     return replace(
         trajectory,
         T_world_body=trajectory.T_world_body[inside],
         times_ns=trajectory.times_ns[inside],
-        frame_indices=None if indices is None else indices[inside],
+        frame_indices=frame_indices,
     )
 
 

@@ -118,7 +118,8 @@ def _log_ratios(runs: Sequence[Outcome], systems: Sequence[str]) -> _LogRatios:
         before = by_system[systems[0]]
         for system in systems:
             after = by_system[system]
-            out[system][rig] = float(np.mean([after[k] - before[k] for k in before if k in after]))
+            changes = [after[k] - before[k] for k in before if k in after]
+            out[system][rig] = float(np.mean(changes))
     return out
 
 

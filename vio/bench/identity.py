@@ -59,7 +59,10 @@ def imported_code(root: str, later: tuple[str, ...]) -> list[str]:
     while names:
         name = names.pop()
         path = Path(ROOT, *name.split("."))
-        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        if path.is_dir():
+            path = path / "__init__.py"
+        else:
+            path = path.with_suffix(".py")
         file = path.relative_to(ROOT).as_posix()
         is_ours = name.split(".")[0] == "vio" and (name == root or not name.startswith("vio.cli"))
         if is_ours and file not in found and path.is_file():
@@ -211,7 +214,9 @@ def _files(path: Path) -> list[Path]:
 def _stat(file: Path, root: Path) -> list[Any]:
     """Name relative to the recording, size, and time of change."""
     facts = file.stat()
-    name = os.path.relpath(file, root) if file != root else ""
+    name = ""
+    if file != root:
+        name = os.path.relpath(file, root)
     return [name.replace(os.sep, "/"), facts.st_size, facts.st_mtime_ns]
 
 

@@ -113,7 +113,8 @@ def map_figures(
     figures: dict[str, Any] = {
         "map_ate_m": evaluate(final, reference, T_cam0_imu=result.T_cam0_body).ate_m.rmse
     }
-    known = np.trace(mapped.causal["covariance"][:, :3, :3], axis1=1, axis2=2) < _LOOPS.placed_m**2
+    P_position = mapped.causal["covariance"][:, :3, :3]
+    known = np.trace(P_position, axis1=1, axis2=2) < _LOOPS.placed_m**2
     for first, end in covered:  # where the cameras show nothing, a pose is no place
         known &= (mapped.causal["index"] < first) | (mapped.causal["index"] >= end)
     placed = mapped.causal[known]
@@ -259,8 +260,10 @@ def _revisits(T_world_cam: dict[int, FloatArray], times_ns: IntArray) -> set[int
     out = set[int]()
     for row, k in enumerate(numbers):
         before = T[:row][times_ns[numbers[:row]] <= times_ns[k] - _REVISIT_NS]
-        near = np.linalg.norm(before[:, :3, 3] - T[row, :3, 3], axis=1) <= _LOOPS.revisit_m
-        along = before[:, :3, 2] @ T[row, :3, 2] >= np.cos(np.radians(_LOOPS.revisit_deg))
+        distance_m = np.linalg.norm(before[:, :3, 3] - T[row, :3, 3], axis=1)
+        near = distance_m <= _LOOPS.revisit_m
+        cosine = before[:, :3, 2] @ T[row, :3, 2]
+        along = cosine >= np.cos(np.radians(_LOOPS.revisit_deg))
         if (near & along).any():
             out.add(k)
     return out

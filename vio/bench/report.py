@@ -114,7 +114,10 @@ def _boxes(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
     axes.set_xticks(
         [j * (len(systems) + 1) + (len(systems) - 1) / 2 for j in range(len(sequences))], sequences
     )
-    axes.tick_params(axis="x", labelrotation=35 if len(sequences) > 5 else 0)
+    labelrotation = 0
+    if len(sequences) > 5:
+        labelrotation = 35
+    axes.tick_params(axis="x", labelrotation=labelrotation)
     axes.set_yscale("log")
     axes.set_ylabel("position error (m)")
     axes.grid(alpha=0.25, axis="y")
@@ -180,7 +183,8 @@ def _system_boxes(rows: Sequence[Row]) -> Any:
         q1, median, q3 = (float(v) for v in np.percentile(known, (25, 50, 75)))
         axes.plot([q1, q3], [k, k], color="#c9d1d9", lw=10, solid_capstyle="butt", zorder=1)
         axes.plot([median, median], [k - 0.2, k + 0.2], color="#111111", lw=1.5)
-        shown = np.sort(known)[np.unique(np.linspace(0, len(known) - 1, _MAX_POINTS).astype(int))]
+        picked = np.unique(np.linspace(0, len(known) - 1, _MAX_POINTS).astype(int))
+        shown = np.sort(known)[picked]
         axes.plot(shown, [k] * len(shown), ".", color=_COLOURS[k % len(_COLOURS)], ms=6, alpha=0.7)
     axes.set_xscale("log")
     axes.set_yticks(range(len(values)), list(values), parse_math=False)

@@ -24,10 +24,13 @@ class Reversed:
     def recording(self) -> Recording:
         """That of the source, with times that go on as long as they went."""
         whole = self.source.recording
+        reference = None
+        if whole.reference is not None:
+            reference = self.backward(whole.reference)
         return replace(
             whole,
             frame_times_ns=self._mirrored(whole.frame_times_ns[self.first : self.end]),
-            reference=None if whole.reference is None else self.backward(whole.reference),
+            reference=reference,
             motion=frozenset(),
         )
 

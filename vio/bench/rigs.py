@@ -58,7 +58,10 @@ def agreements(suite: Suite, outcomes: Iterable[Outcome]) -> tuple[Agreement, ..
     found = []
     for a, b in combinations(_runs(suite, outcomes), 2):
         kind = _kind(a, b, first)
-        difference = None if kind is None else field_difference(a.field, b.field)
+        if kind is None:
+            difference = None
+        else:
+            difference = field_difference(a.field, b.field)
         if kind is not None and difference is not None:
             found.append(Agreement(a.rig, kind, (a.name, b.name), difference))
     return tuple(found)

@@ -193,7 +193,8 @@ def _replay_basalt(program: Program, sequence: Sequence, data: Path, out: Path) 
         if not written.imu_samples:
             raise DataError(f"{sequence.name}: has no IMU, which Basalt needs here")
         times_ns = dataset.recording.frame_times_ns[first:last]
-        hz = max(written.imu_samples / max(float(times_ns[-1] - times_ns[0]) * S_PER_NS, 1e-9), 1.0)
+        duration_s = float(times_ns[-1] - times_ns[0]) * S_PER_NS
+        hz = max(written.imu_samples / max(duration_s, 1e-9), 1.0)
         text = basalt_text(load_rig(folder), hz)
         assert text is not None  # of rectified images
         (folder / "calibration.json").write_text(text, encoding="utf-8")

@@ -239,7 +239,10 @@ def _check_known(suite: Suite, names: Iterable[str], known: list[str]) -> None:
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean '{near[0]}'?" if near else f"; it holds {', '.join(known[:8])}"
+            if near:
+                hint = f"; did you mean '{near[0]}'?"
+            else:
+                hint = f"; it holds {', '.join(known[:8])}"
             raise ConfigError(f"suite {suite.name} has no '{name}'{hint}")
 
 
@@ -386,7 +389,10 @@ def _positive(value: Any, name: str, where: str) -> float:
 
 
 def _seeds(value: Any, where: str) -> tuple[int, ...]:
-    seeds = list(range(value)) if isinstance(value, int) and not isinstance(value, bool) else value
+    if isinstance(value, int) and not isinstance(value, bool):
+        seeds = list(range(value))
+    else:
+        seeds = value
     fine = (
         isinstance(seeds, list)
         and 0 < len(seeds) <= _MAX_SEEDS
@@ -416,7 +422,10 @@ def _nested(values: Mapping[str, Any], where: str) -> dict[str, Any]:
                 raise ConfigError(
                     f"{where}: '{key}' and '{section}' exclude each other; give one of them"
                 )
-        inner[last] = {**inner.get(last, {}), **value} if isinstance(value, dict) else value
+        if isinstance(value, dict):
+            inner[last] = {**inner.get(last, {}), **value}
+        else:
+            inner[last] = value
     return out
 
 
@@ -431,5 +440,8 @@ def _only_keys(given: Mapping[str, Any], known: Iterable[str], where: str) -> No
     for key in given:
         if key not in names:
             near = difflib.get_close_matches(str(key), names, 1)
-            hint = f"did you mean '{near[0]}'?" if near else f"valid here: {', '.join(names)}"
+            if near:
+                hint = f"did you mean '{near[0]}'?"
+            else:
+                hint = f"valid here: {', '.join(names)}"
             raise ConfigError(f"{where}: unknown key '{key}'; {hint}")

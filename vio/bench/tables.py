@@ -193,7 +193,9 @@ def cell_of(values: Iterable[float | None], metric: Metric) -> Cell | None:
     if not known:
         return None
     worst = min(known) if metric.larger_is_better else max(known)
-    sd = statistics.stdev(known) if len(known) > 1 else 0.0
+    sd = 0.0
+    if len(known) > 1:
+        sd = statistics.stdev(known)
     return Cell(
         statistics.median(known),
         worst,
@@ -245,14 +247,20 @@ def cell_text(
     differs = cell.count > 1 and cell.spread > 0
     if for_documents:
         whole = float(cell.median).is_integer()
-        text = number(cell.median, metric.digits) if whole else _padded(cell.median, metric.digits)
-        sd = min(f"{cell.sd:.{len(text.partition('.')[2])}f}", _padded(cell.sd, 2), key=len)
+        if whole:
+            text = number(cell.median, metric.digits)
+        else:
+            text = _padded(cell.median, metric.digits)
+        digits = len(text.partition(".")[2])
+        sd = min(f"{cell.sd:.{digits}f}", _padded(cell.sd, 2), key=len)
         text += f" ± {sd}" if differs and float(sd) else ""
     else:
         text = number(cell.median, metric.digits)
         if differs:
             text += f" ({number(cell.mean, metric.digits)} ± {number(cell.sd, 2)})"
-    return text if runs in (None, cell.count) else f"{text}, n = {cell.count}"
+    if runs in (None, cell.count):
+        return text
+    return f"{text}, n = {cell.count}"
 
 
 class Notes:
@@ -263,7 +271,9 @@ class Notes:
 
     def dash(self, row: Row, metric: Metric) -> str:
         """Return the text of an undefined figure."""
-        lost = f"no result: {row.failure}" if row.failed == row.runs else None
+        lost = None
+        if row.failed == row.runs:
+            lost = f"no result: {row.failure}"
         return self.because(lost or row.absent.get(metric.name, "not reported"))
 
     def because(self, why: str) -> str:
@@ -289,7 +299,9 @@ def markdown(
     suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], facts: Mapping[str, Any]
 ) -> str:
     """Return all tables of a bench."""
-    seeds = f", seeds {', '.join(map(str, suite.seeds))}" if len(suite.seeds) > 1 else ""
+    seeds = ""
+    if len(suite.seeds) > 1:
+        seeds = f", seeds {', '.join(map(str, suite.seeds))}"
     parts = [
         f"# {suite.name}\n\n{provenance(facts)}{seeds}.\n",
         "## ATE in m\n\nMedian over the seeds (mean ± standard deviation).\n\n"
@@ -322,7 +334,10 @@ def _failures(outcomes: Sequence[Outcome]) -> list[str]:
     lines = []
     for o in outcomes:
         if o.failure is not None:
-            seed = "" if o.seed is None else f", seed {o.seed}"
+            if o.seed is None:
+                seed = ""
+            else:
+                seed = f", seed {o.seed}"
             lines.append(f"- {o.sequence}, {o.system}{seed}: {printable(o.failure)}")
     return lines
 
@@ -373,7 +388,9 @@ def matrix(
 def _chosen_systems(rows: Iterable[Row], chosen: Sequence[str]) -> list[str]:
     """Return the chosen ones of the systems in the rows; none chosen: all, ours first."""
     known = dict.fromkeys(row.system for row in sorted(rows, key=lambda row: row.is_peer))
-    return [system for system in chosen if system in known] if chosen else list(known)
+    if chosen:
+        return [system for system in chosen if system in known]
+    return list(known)
 
 
 def _by_sequence(rows: Iterable[Row]) -> dict[str, dict[str, Row]]:
@@ -501,8 +518,14 @@ def _names_that_differ(rows: Sequence[Row]) -> list[str]:
 
 def _runs_and_success(row: Row) -> list[str]:
     """Return the cells of how many runs gave a result, and how many of them a good one."""
-    runs = f"{row.runs - row.failed} of {row.runs}" if row.failed else f"{row.runs}"
-    share = "–" if row.succeeded is None else f"{100 * row.succeeded / row.runs:.0f} %"
+    if row.failed:
+        runs = f"{row.runs - row.failed} of {row.runs}"
+    else:
+        runs = f"{row.runs}"
+    if row.succeeded is None:
+        share = "–"
+    else:
+        share = f"{100 * row.succeeded / row.runs:.0f} %"
     return [runs, share]
 
 
@@ -520,7 +543,10 @@ def _median_and_worst(cell: Cell | None, metric: Metric) -> str:
     """Return a figure over the sequences as text, with their number in brackets."""
     if cell is None:
         return "–"
-    worst = "" if cell.count == 1 else f", worst {number(cell.worst, metric.digits)}"
+    if cell.count == 1:
+        worst = ""
+    else:
+        worst = f", worst {number(cell.worst, metric.digits)}"
     return f"{number(cell.median, metric.digits)}{worst} ({cell.count})"
 
 
@@ -529,7 +555,9 @@ def _success_of(rows: Iterable[Row]) -> str:
     judged = [row for row in rows if row.succeeded is not None]
     runs = sum(row.runs for row in judged)
     succeeded = sum(row.succeeded or 0 for row in judged)
-    return f"{100 * succeeded / runs:.0f} % of {runs}" if runs else "–"
+    if not runs:
+        return "–"
+    return f"{100 * succeeded / runs:.0f} % of {runs}"
 
 
 def csv_of_rows(rows: Iterable[Row]) -> str:
@@ -543,7 +571,10 @@ def csv_of_rows(rows: Iterable[Row]) -> str:
         values = [
             "" if cell is None else repr(getattr(cell, part)) for cell in cells for part in parts
         ]
-        succeeded = "" if row.succeeded is None else str(row.succeeded)
+        if row.succeeded is None:
+            succeeded = ""
+        else:
+            succeeded = str(row.succeeded)
         lines.append([row.sequence, row.system, str(row.runs), str(row.failed), succeeded, *values])
     return _csv([head, *lines])
 

@@ -74,7 +74,10 @@ def inputs_of(sequence: Sequence, data: Path) -> list[Path]:
     """Return what a sequence reads: its recording or the files of its render, and its ground
     truth.
     """
-    paths = [] if sequence.source is None else [_source(sequence.source, data)[1]]
+    if sequence.source is None:
+        paths = []
+    else:
+        paths = [_source(sequence.source, data)[1]]
     paths += [
         data / value
         for head, value in _render_words(sequence)
@@ -135,7 +138,10 @@ def _task(
     except DataError as error:
         return replace(task, failure=" ".join(str(error).split()))
     job |= {"kind": "run", "config": config}
-    size = math.inf if identity["bytes"] is None else identity["bytes"]
+    if identity["bytes"] is None:
+        size = math.inf
+    else:
+        size = identity["bytes"]
     return replace(task, job=job, key=digest_of([_FORM, "run", identity, known]), size=size)
 
 
@@ -161,7 +167,10 @@ def _common(
         "scratch": None,
         "first": None,
     }
-    exact = bool(sequence.render) if sequence.exact_truth is None else sequence.exact_truth
+    if sequence.exact_truth is None:
+        exact = bool(sequence.render)
+    else:
+        exact = sequence.exact_truth
     shared: dict[str, Any] = {
         "start": sequence.start,
         "stop": sequence.stop,

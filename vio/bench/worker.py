@@ -87,7 +87,9 @@ class _CpuTimer:
     def ms_per_frame(self) -> float | None:
         """Mean CPU time of a frame after the first ones; None: there were no others."""
         count = self.frames - _WARM_FRAMES
-        return 1e3 * (self._ended_s - self._began_s) / count if count > 0 else None
+        if count > 0:
+            return 1e3 * (self._ended_s - self._began_s) / count
+        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +136,10 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
         record["keep"] = not (from_system or isinstance(error, _WrongPlaceError))
     except MemoryError:
         record |= {"failure": "out of memory", "keep": False}
-    record["measured"] = {} if job["kind"] == "peer" else _measured(timer, began)
+    if job["kind"] == "peer":
+        record["measured"] = {}
+    else:
+        record["measured"] = _measured(timer, began)
     return record
 
 
@@ -155,7 +160,10 @@ def _covered_spans(recording: Recording, covered: Sequence[Any]) -> tuple[tuple[
 def _truth(job: dict[str, Any], config: Config) -> _Truth:
     """Open the recording of a job."""
     dataset = open_dataset(job["source"], config.dataset)
-    stop = None if job["stop"] is None else parse_bound(job["stop"])
+    if job["stop"] is None:
+        stop = None
+    else:
+        stop = parse_bound(job["stop"])
     first, end = frames_between(dataset.recording, parse_bound(job["start"]), stop)
     total = len(dataset.recording.frame_times_ns)
     spans = _covered_spans(dataset.recording, job["covered"])
@@ -288,7 +296,10 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
                 keep_observations=True,
             )
             made = adjust_map(made, store)
-            T_ref_map = None if before.reference is None else _world_of_map(made, before.reference)
+            if before.reference is None:
+                T_ref_map = None
+            else:
+                T_ref_map = _world_of_map(made, before.reference)
         first = truth.first
         end = truth.end
         kept = bool(job["map"])
@@ -356,8 +367,13 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
 
 def _field(result: RunResult) -> dict[str, Any] | None:
     """What the run has found that the stereo calibration is off by; None: nothing is estimated."""
-    field = result.estimates[-1].stereo_field if len(result.estimates) else None
-    found = None if field is None else disparity_field(result.recording.camera, field)
+    field = None
+    if len(result.estimates):
+        field = result.estimates[-1].stereo_field
+    if field is None:
+        found = None
+    else:
+        found = disparity_field(result.recording.camera, field)
     return None if found is None else found.as_dict()
 
 

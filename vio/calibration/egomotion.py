@@ -195,7 +195,9 @@ def _links(tracks: FeatureTracks) -> tuple[IntArray, IntArray]:
     order = np.lexsort((frames, tracks.ids))
     a = order[:-1]
     b = order[1:]
-    linked = (tracks.ids[a] == tracks.ids[b]) & (frames[a] + 1 == frames[b]) & usable[a] & usable[b]
+    same_track = tracks.ids[a] == tracks.ids[b]
+    next_frame = frames[a] + 1 == frames[b]
+    linked = same_track & next_frame & usable[a] & usable[b]
     a = a[linked]
     b = b[linked]
     by_frame = np.argsort(a, kind="stable")
@@ -218,7 +220,10 @@ def camera_motion(
     brief = dt < _MOTION.max_gap_s
     found = CameraMotion(times_ns, found.frames[brief], found.twists[brief])
     if len(found.frames) < _MOTION.min_twists:
-        gap = float(np.median(np.diff(times_ns))) * S_PER_NS if len(times_ns) > 1 else float("inf")
+        if len(times_ns) > 1:
+            gap = float(np.median(np.diff(times_ns))) * S_PER_NS
+        else:
+            gap = float("inf")
         return NotObservable(
             "IMU-camera calibration",
             f"only {len(found.frames)} frame intervals determine the camera's motion "

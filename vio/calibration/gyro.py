@@ -53,7 +53,8 @@ def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservab
         part = keep.copy()
         part[block] = False
         refits.append(problem.fit(solution, part))
-    turns = np.array([so3_log(so3_exp(x[:3]) @ so3_exp(solution[:3]).T) for x in refits])
+    R_back = so3_exp(solution[:3]).T
+    turns = np.array([so3_log(so3_exp(x[:3]) @ R_back) for x in refits])
     errors = jackknife(np.concatenate([turns, np.array(refits)[:, 3:]], axis=1))
     errors = np.maximum(errors, problem.formal_sigma(solution, keep, sigma))
     rotation_sigma = np.degrees(errors[:3])
@@ -82,7 +83,8 @@ class _GyroProblem:
     def __init__(self, motion: CameraMotion, rates: Rates) -> None:
         self._origin = int(motion.times_ns[0])
         self._t = (rates.times_ns - self._origin) * S_PER_NS
-        steps = np.diff(self._t)[:, None] * (rates.angular[1:] + rates.angular[:-1]) / 2
+        twice_mean = rates.angular[1:] + rates.angular[:-1]
+        steps = np.diff(self._t)[:, None] * twice_mean / 2
         self._turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         self._begin = (motion.times_ns[motion.frames] - self._origin) * S_PER_NS
         self._end = (motion.times_ns[motion.frames + 1] - self._origin) * S_PER_NS
@@ -90,7 +92,9 @@ class _GyroProblem:
         self._omega = motion.twists[:, 3:]
         margin = _FIT.largest_offset_s
         inside = (self._begin >= self._t[0]) & (self._end <= self._t[-1])
-        shiftable = (self._begin - margin >= self._t[0]) & (self._end + margin <= self._t[-1])
+        after_begin = self._begin - margin >= self._t[0]
+        before_end = self._end + margin <= self._t[-1]
+        shiftable = after_begin & before_end
         self.covered: BoolArray = shiftable if shiftable.sum() > 0.5 * inside.sum() else inside
         self._velocities: tuple[FloatArray, FloatArray] | None = None
         if not rates.inertial:
@@ -185,7 +189,8 @@ class _GyroProblem:
             else:
                 plus = x + step
                 minus = x - step
-            J[:, k] = (self.residuals(plus) - self.residuals(minus))[keep].ravel() / (2 * h)
+            change = self.residuals(plus) - self.residuals(minus)
+            J[:, k] = change[keep].ravel() / (2 * h)
         scale = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
         information = (J / scale).T @ (J / scale) + 1e-12 * np.eye(7)
         return sigma * np.sqrt(np.diag(np.linalg.inv(information))) / scale

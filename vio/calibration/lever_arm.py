@@ -149,16 +149,19 @@ def _window(
     T = np.eye(4)
     T_start_cam = []
     for k in range(n):
-        T = T @ se3_inverse(se3_exp(-(t[k + 1] - t[k]) * steps[first + k]))
+        step_s = t[k + 1] - t[k]
+        T = T @ se3_inverse(se3_exp(-step_s * steps[first + k]))
         T_start_cam.append(T)
     poses = np.array(T_start_cam)
     s = _integrals(t, t_imu, gyro, force, R_cam0_imu)
     elapsed = t[1:] - t[0]
-    rows = np.concatenate([poses[:, :3, :3] - np.eye(3), s[:, :, 1:]], axis=2).reshape(3 * n, 6)
+    turned = poses[:, :3, :3] - np.eye(3)
+    rows = np.concatenate([turned, s[:, :, 1:]], axis=2).reshape(3 * n, 6)
     right = (s[:, :, 0] - poses[:, :3, 3]).reshape(3 * n)
-    nuisance = np.concatenate(
-        [elapsed[:, None, None] * np.eye(3), elapsed[:, None, None] ** 2 / 2 * np.eye(3)], axis=2
-    ).reshape(3 * n, 6)
+    seconds = elapsed[:, None, None]
+    by_velocity = seconds * np.eye(3)
+    by_gravity = seconds**2 / 2 * np.eye(3)
+    nuisance = np.concatenate([by_velocity, by_gravity], axis=2).reshape(3 * n, 6)
     Q = np.linalg.qr(nuisance, mode="complete")[0][:, 6:]
     return Q.T @ rows, Q.T @ right
 
@@ -183,7 +186,8 @@ def _integrals(
     rotation = np.array(R)
     value = np.concatenate([(rotation @ f[..., None]), rotation], axis=2)  # (m, 3, 4)
     mean = (value[1:] + value[:-1]) / 2
-    velocity = np.concatenate([np.zeros((1, 3, 4)), np.cumsum(dt[:, None, None] * mean, axis=0)])
+    gained = np.cumsum(dt[:, None, None] * mean, axis=0)
+    velocity = np.concatenate([np.zeros((1, 3, 4)), gained])
     third = (
         dt[:, None, None] * velocity[:-1]
         + dt[:, None, None] ** 2 * (2 * value[:-1] + value[1:]) / 6
@@ -197,13 +201,14 @@ def _solve_windows(blocks: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArra
     weights: FloatArray = np.ones(len(blocks))
     x: FloatArray = np.zeros(6)
     for _ in range(6):
-        normal = sum(
-            (w * A.T @ A for w, (A, _) in zip(weights, blocks, strict=True)), 1e-9 * np.eye(6)
-        )
-        right = sum((w * A.T @ b for w, (A, b) in zip(weights, blocks, strict=True)), np.zeros(6))
+        weighted = list(zip(weights, blocks, strict=True))
+        normal = sum((w * A.T @ A for w, (A, _) in weighted), 1e-9 * np.eye(6))
+        right = sum((w * A.T @ b for w, (A, b) in weighted), np.zeros(6))
         x = np.linalg.solve(normal, right)
-        rms = np.array([np.sqrt(np.mean((A @ x - b) ** 2)) for A, b in blocks])
-        weights = 1 / (1 + (rms / max(float(np.median(rms)), 1e-9)) ** 2) ** 2
+        residuals = [A @ x - b for A, b in blocks]
+        rms = np.array([np.sqrt(np.mean(r**2)) for r in residuals])
+        usual = max(float(np.median(rms)), 1e-9)
+        weights = 1 / (1 + (rms / usual) ** 2) ** 2
     return x
 
 
@@ -246,7 +251,8 @@ def judge_lever_arms(
         lever_arms: the two candidates, (3,) metres in the imu frame.
     """
     middle = (velocities[:-1] + velocities[1:]) / 2
-    turned = np.concatenate([middle[:, :3] @ R_cam0_imu.T, middle[:, 3:] @ R_cam0_imu.T], axis=1)
+    R_imu_cam0 = R_cam0_imu.T
+    turned = np.concatenate([middle[:, :3] @ R_imu_cam0, middle[:, 3:] @ R_imu_cam0], axis=1)
     seen = stereo_twists(camera, tracks, times_ns, turned)
     count = len(seen.frames)
     if count < _JUDGE.min_intervals:
@@ -258,14 +264,17 @@ def judge_lever_arms(
     y = v_cam - middle[seen.frames, :3] - np.cross(omega, centre)
     speed = np.linalg.norm(v_cam, axis=1)
     yaw_rate = omega[:, np.argmax(omega.std(axis=0))]
-    nuisance = np.stack([np.ones(count), speed, np.gradient(speed), yaw_rate * speed**2], axis=1)
+    sideways = yaw_rate * speed**2
+    nuisance = np.stack([np.ones(count), speed, np.gradient(speed), sideways], axis=1)
     signal = np.cross(omega, half)
     every = np.arange(count)
     place = _fit_place(y, signal, nuisance)
     left_out = [np.setdiff1d(every, block) for block in np.array_split(every, _JUDGE.judged_blocks)]
     refits = [_fit_place(y[keep], signal[keep], nuisance[keep]) for keep in left_out]
     sigma = max(float(jackknife(refits)), _JUDGE.min_sigma)
-    better = int(place > 0) if 2 * abs(place) / sigma**2 > _JUDGE.log_odds else None
+    better = None
+    if 2 * abs(place) / sigma**2 > _JUDGE.log_odds:
+        better = int(place > 0)
     return LeverArmVerdict(better, place, sigma, count)
 
 
@@ -288,7 +297,8 @@ def _fit_place(y: FloatArray, signal: FloatArray, nuisance: FloatArray) -> float
             r = y[:, axis] - X @ x
             sigma = max(robust_sigma(r), 1e-9)
             weight = np.minimum(1.0, _FIT.huber * sigma / np.maximum(np.abs(r), 1e-12))
-        variance = float(np.linalg.inv(normal)[0, 0]) * (sigma / scale[0]) ** 2
+        inverse = np.linalg.inv(normal)
+        variance = float(inverse[0, 0]) * (sigma / scale[0]) ** 2
         top += x[0] / variance
         bottom += 1 / variance
     return top / bottom

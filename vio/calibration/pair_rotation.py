@@ -81,7 +81,7 @@ def turned_pixels(camera: StereoCamera, rotation: FloatArray) -> FloatArray:
     """Return the homography (3, 3) from pixels of a right camera as calibrated to those of one that
     is turned by `rotation` (3,) rad.
     """
-    K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
+    K = camera.K
     return np.asarray(K @ so3_exp(rotation) @ np.linalg.inv(K), dtype=np.float64)
 
 
@@ -111,7 +111,8 @@ def rotation_by_rows(camera: StereoCamera, z: FloatArray) -> PairRotation | None
         weights = 1.0 / (1.0 + (r / width) ** 2)
         sigma = max(_FIT.sigma_px, robust_sigma(r[np.abs(r) < 2 * width]))
         normal = (J.T * weights) @ J / sigma**2 + prior
-        w = w - np.linalg.solve(normal, (J.T * weights) @ r / sigma**2 + prior @ w)
+        gradient = (J.T * weights) @ r / sigma**2 + prior @ w
+        w = w - np.linalg.solve(normal, gradient)
     near = np.abs(off(w)) < _FIT.near_px
     if near.sum() < _FIT.min_points:
         return None
@@ -176,7 +177,9 @@ def _undone(rays: FloatArray, R: FloatArray, p2: FloatArray | None = None) -> Fl
     if p2 is not None:
         x = rays[:, 0]
         y = rays[:, 1]
-        bend = np.stack([3 * x * x + y * y, 2 * x * y, np.zeros(len(rays))], axis=1)
+        bend_u = 3 * x * x + y * y
+        bend_v = 2 * x * y
+        bend = np.stack([bend_u, bend_v, np.zeros(len(rays))], axis=1)
         rays = rays - p2[..., None, None] * bend
     turned = rays @ R
     return np.asarray(turned[..., :2] / turned[..., 2:], dtype=np.float64)
@@ -205,7 +208,8 @@ class _SeenTwice:
         left = self._left[0]
         right = _undone(self._rays[0], so3_exp(rotation))
         row = 0.5 * (left[:, 1] + right[:, 1])
-        return np.stack([left[:, 0], row, left[:, 0] - right[:, 0]], axis=1)
+        disparity = left[:, 0] - right[:, 0]
+        return np.stack([left[:, 0], row, disparity], axis=1)
 
     @property
     def focal_px(self) -> float:
@@ -277,7 +281,8 @@ def _start(seen: _SeenTwice, rotation: FloatArray) -> tuple[FloatArray, BoolArra
     focal = seen.focal_px
     points = seen.points(rotation)
     d = np.maximum(points[:, 2], _FIT.min_disparity_px / focal)
-    p = np.stack([points[:, 0], points[:, 1], np.ones(len(d))], axis=1) / d[:, None]
+    homogeneous = np.stack([points[:, 0], points[:, 1], np.ones(len(d))], axis=1)
+    p = homogeneous / d[:, None]
     shared = np.zeros(_SHARED)
     shared[:3] = rotation
     known, turn, shift, rows = cv2.solvePnPRansac(

@@ -119,7 +119,8 @@ def _readings(rig: StereoRig) -> Iterator[tuple[str, StereoRig, _Change]]:
     exchanged = replace(rig, cam0=rig.cam1, cam1=rig.cam0)
     yield "the intrinsics of left and right are exchanged", exchanged, _same
     T = rig.T_cam0_cam1
-    turned = rig.T_imu_cam0 @ se3_from_parts(T[:3, :3].T, T[:3, 3])
+    back = se3_from_parts(T[:3, :3].T, T[:3, 3])
+    turned = rig.T_imu_cam0 @ back
     yield (
         "the rotation between the cameras is the inverse one",
         replace(rig, T_imu_cam1=turned),

@@ -149,8 +149,13 @@ def refine_stereo(
     for gate in (np.radians(_FIT.widest_deg), np.radians(_FIT.narrower_deg), None):
         angles = np.abs(epipolar_angles(R, d, matches))
         near = angles < np.radians(_FIT.widest_deg)
-        spread = robust_sigma(angles[near]) if near.any() else 1.0
-        limit = gate if gate is not None else max(4 * spread, 1e-5)
+        spread = 1.0
+        if near.any():
+            spread = robust_sigma(angles[near])
+        if gate is not None:
+            limit = gate
+        else:
+            limit = max(4 * spread, 1e-5)
         inliers = matches.take(angles < limit)
         if few := too_few(inliers):
             return few
@@ -225,7 +230,9 @@ def _structure(values: FloatArray, cells: IntArray) -> float:
         for k, n in enumerate(np.bincount(cells))
         if n >= _LENS.min_in_cell
     ]
-    return float(np.sqrt(np.mean(np.square(medians)))) if medians else float("inf")
+    if medians:
+        return float(np.sqrt(np.mean(np.square(medians))))
+    return float("inf")
 
 
 def _bends(rays: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -239,7 +239,10 @@ class CalibratedRig:
             if name in _TEXT and value * value > _FIELD.named_sigmas**2 * variance:
                 text, scale, form = _TEXT[name]
                 out.append(text.format(f"{scale * value:+{form}} ± {scale * variance**0.5:{form}}"))
-        found = {} if self.scale is None else self.scale.percent()
+        if self.scale is None:
+            found = {}
+        else:
+            found = self.scale.percent()
         out += [
             f"{name} off by {percent:+.2f} ± {sigma:.2f} %"
             for name, (percent, sigma) in found.items()
@@ -437,7 +440,8 @@ class _Frame:
         self, believed: CameraModel, real: CameraModel, turn: FloatArray, R_rect_cam: FloatArray
     ) -> FloatArray:
         """Return where a camera shows the grid's pixels (N, 2) if it is another than believed."""
-        raw, _ = project_point(real, left_rays(self.camera, self.grid[:, :2]) @ turn.T)
+        rays = left_rays(self.camera, self.grid[:, :2])
+        raw, _ = project_point(real, rays @ turn.T)
         seen, _ = rectify_pixels(believed, R_rect_cam, self.camera, raw)
         return seen
 
@@ -452,7 +456,8 @@ class _Frame:
         grid's pixels.
         """
         seen = self.as_seen(x)
-        D = error_basis(self.camera, self.where_read(seen)).reshape(-1, TERMS)[:, :_BELOW]
+        basis = error_basis(self.camera, self.where_read(seen))
+        D = basis.reshape(-1, TERMS)[:, :_BELOW]
         found = np.linalg.lstsq(D, (seen - self.grid).ravel(), rcond=None)[0]
         return np.append(found, -x[PARAMETERS.index("ty")])  # shown by near points alone
 

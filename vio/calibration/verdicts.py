@@ -131,7 +131,10 @@ def _opposite(estimate: StereoEstimate, given: FloatArray) -> bool:
 
 
 def _turn_limit_deg(estimate: StereoEstimate) -> float:
-    least = _NAMED.rotation_deg if estimate.segments is None else _NAMED.in_motion_deg
+    if estimate.segments is None:
+        least = _NAMED.rotation_deg
+    else:
+        least = _NAMED.in_motion_deg
     return max(least, _NAMED.sigmas * estimate.rotation_sigma_deg)
 
 
@@ -222,7 +225,8 @@ def _judge_translation(lever_arm: LeverArm, T_cam0_imu: FloatArray) -> Iterator[
     R = T_cam0_imu[:3, :3]
     t = T_cam0_imu[:3, 3]
     off_m = float(np.linalg.norm(lever_arm.t_cam0_imu - t))
-    if off_m <= max(_NAMED.lever_arm_m, _NAMED.sigmas * float(np.linalg.norm(lever_arm.sigma_m))):
+    sigma_m = float(np.linalg.norm(lever_arm.sigma_m))
+    if off_m <= max(_NAMED.lever_arm_m, _NAMED.sigmas * sigma_m):
         return
     others = {
         "its negative": -t,
@@ -292,7 +296,8 @@ def _unit(v: FloatArray) -> FloatArray:
 
 
 def _between_deg(a: FloatArray, b: FloatArray) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+    sine = np.linalg.norm(np.cross(a, b))
+    return float(np.degrees(np.arctan2(sine, a @ b)))
 
 
 def _triple(v: FloatArray) -> str:

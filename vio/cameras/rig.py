@@ -100,7 +100,9 @@ class Rectifier:
 
     def left(self, image: Image) -> Image:
         """Rectify a raw left image (H, W) alone, or the image of one camera."""
-        return image if self.maps is None else remap(image, self.maps[0], self.interpolation)
+        if self.maps is None:
+            return image
+        return remap(image, self.maps[0], self.interpolation)
 
     def depth(self, depth_m: FloatArray) -> FloatArray:
         """Undistort a depth image (H, W) in metres: each pixel takes the nearest depth, as means
@@ -109,8 +111,11 @@ class Rectifier:
         if self.maps is None:
             return depth_m
         u, v = (np.rint(m).astype(np.int64) for m in self.maps[0])
-        inside = (u >= 0) & (v >= 0) & (u < depth_m.shape[1]) & (v < depth_m.shape[0])
-        return np.where(inside, depth_m[np.where(inside, v, 0), np.where(inside, u, 0)], 0.0)
+        height, width = depth_m.shape
+        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        row = np.where(inside, v, 0)
+        column = np.where(inside, u, 0)
+        return np.where(inside, depth_m[row, column], 0.0)
 
     def frame(
         self,
@@ -325,7 +330,9 @@ class Rig:
     @property
     def cameras(self) -> tuple[CameraModel, ...]:
         """The cameras: left and right, or the only one."""
-        return (self.cam0,) if self.cam1 is None else (self.cam0, self.cam1)
+        if self.cam1 is None:
+            return (self.cam0,)
+        return (self.cam0, self.cam1)
 
     @property
     def right(self) -> tuple[CameraModel, FloatArray]:
@@ -346,7 +353,10 @@ class Rig:
             CalibrationError: there is one camera.
         """
         cam1, T_cam1_cam0 = self.right
-        T_imu_cam0 = np.eye(4) if self.T_cam0_imu is None else se3_inverse(self.T_cam0_imu)
+        if self.T_cam0_imu is None:
+            T_imu_cam0 = np.eye(4)
+        else:
+            T_imu_cam0 = se3_inverse(self.T_cam0_imu)
         return StereoRig(self.cam0, cam1, T_imu_cam0, T_imu_cam0 @ se3_inverse(T_cam1_cam0))
 
     @property
@@ -409,14 +419,20 @@ class Rig:
         if self.cam1 is None:
             camera, maps = _undistorted(self.cam0)
             camera = camera if depth_noise is None else with_virtual_baseline(camera, depth_noise)
-            T = np.eye(4) if self.T_cam0_imu is None else self.T_cam0_imu
+            if self.T_cam0_imu is None:
+                T = np.eye(4)
+            else:
+                T = self.T_cam0_imu
             return Rectifier(self.cam0, camera, T, maps, interpolation, self.time_offset_s)
         made = rectifier_of(self.stereo, interpolation, projection)
         camera = replace(made.camera, residual_px=self.residual_px)
         made = replace(made, camera=camera, time_offset_s=self.time_offset_s)
         if made.maps is not None:
             return made
-        T = made.T_rect0_imu if self.T_cam0_imu is None else self.T_cam0_imu
+        if self.T_cam0_imu is None:
+            T = made.T_rect0_imu
+        else:
+            T = self.T_cam0_imu
         return replace(made, camera=self._exact(camera), T_rect0_imu=T)
 
     def _exact(self, pair: StereoCamera) -> StereoCamera:
@@ -425,7 +441,8 @@ class Rig:
         """
         _, T = self.right
         x, y, z = T[:3, 3].tolist()
-        stated = not np.any(T[:3, :3] != np.eye(3)) and y == z == 0
+        is_turned = np.any(T[:3, :3] != np.eye(3))
+        stated = not is_turned and y == z == 0
         return replace(pair, baseline_m=-x) if stated else pair
 
     def noting(self, *notes: str) -> Rig:

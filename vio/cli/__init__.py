@@ -134,9 +134,15 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line; an unknown option shows the usage of its subcommand, not that of
     `vio`.
     """
-    words = sys.argv[1:] if argv is None else list(argv)
+    if argv is None:
+        words = sys.argv[1:]
+    else:
+        words = list(argv)
     command = next((word for word in words if not word.startswith("-")), None)
-    parser = build_parser([command]) if command in COMMANDS else build_parser()
+    if command in COMMANDS:
+        parser = build_parser([command])
+    else:
+        parser = build_parser()
     if command is not None and command not in COMMANDS:
         parser.error(f"there is no command {command!r}{_near(command, COMMANDS) or _SEE_HELP}")
     args, unknown = parser.parse_known_args(words)
@@ -145,7 +151,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
             a for a in parser._actions if isinstance(a, argparse._SubParsersAction)
         ).choices[args.command]
         first = unknown[0].partition("=")[0]
-        hint = _near(first, chosen._option_string_actions) if first.startswith("-") else ""
+        hint = ""
+        if first.startswith("-"):
+            hint = _near(first, chosen._option_string_actions)
         chosen.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     args.command_line = shlex.join(["vio", *words])
     return args
@@ -233,5 +241,8 @@ def _message(error: VioError | OSError | MemoryError) -> str:
     # A path that no check foresaw: too long a name, a folder that may not be entered, a disk that
     # fails.
     file = error.filename
-    where = "cannot write the output" if file is None else f"cannot use {str(file)[:_MAX_SHOWN]}"
+    if file is None:
+        where = "cannot write the output"
+    else:
+        where = f"cannot use {str(file)[:_MAX_SHOWN]}"
     return f"{where}: {error.strerror or error}"

@@ -140,7 +140,9 @@ def map_from(args: argparse.Namespace) -> MapUse | None:
 
     if args.localise and args.map is None:
         raise ConfigError("--localise needs --map FILE")
-    return None if args.map is None else MapUse(args.map, args.localise)
+    if args.map is None:
+        return None
+    return MapUse(args.map, args.localise)
 
 
 def add_mavlink_arguments(parser: argparse.ArgumentParser) -> None:

@@ -181,7 +181,10 @@ def _place(suite: Suite, args: argparse.Namespace) -> Place:
 
     data = args.data
     if data is None:
-        data = Path() if suite.folder == SHIPPED else suite.folder
+        if suite.folder == SHIPPED:
+            data = Path()
+        else:
+            data = suite.folder
     return Place(
         data=data,
         out=args.out or Path("bench") / suite.name,
@@ -264,7 +267,9 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
     lines.append(("tasks", f"{len(result.outcomes)}, of which {result.reused} were done before"))
     lines.append(("report", f"{out / 'report.html'}, tables.md, tables.tex, table.csv, runs.csv"))
     facts = {**result.facts, "out": str(out), "reused": result.reused}
-    folds = cross_validate(result.outcomes) if args.folds and not result.failures else None
+    folds = None
+    if args.folds and not result.failures:
+        folds = cross_validate(result.outcomes)
     if folds is not None:
         facts["folds"] = folds.as_dict()
     width = max(10, *(len(name) for name, _ in lines))
@@ -296,7 +301,10 @@ def _compare(args: argparse.Namespace) -> int:
 
     a = args.folders[0]
     b = args.folders[-1]
-    between = None if args.between is None else tuple(args.between)
+    if args.between is None:
+        between = None
+    else:
+        between = tuple(args.between)
     if args.folds:
         return _compare_folds(a, b, args)
     result = compare(a, b, between=between, factor=args.factor, margin=args.margin)
@@ -315,7 +323,10 @@ def _compare_folds(a: Path, b: Path, args: argparse.Namespace) -> int:
     from vio.bench.folds import cross_validate, fold_lines
 
     if args.between is not None and a == b:
-        sides = [(a, args.between[0], "A"), (a, args.between[1], "B")]
+        sides = [
+            (a, args.between[0], "A"),
+            (a, args.between[1], "B"),
+        ]
     else:
         of_a, of_b = args.between or (None, None)
         sides = [(a, of_a, "A"), (b, of_b, "B")]

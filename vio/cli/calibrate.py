@@ -190,7 +190,9 @@ def _observed(name: str, found: _Part | NotObservable, rows: Callable[[_Part], _
     """Return the rows of a part of the calibration, or why it was not observable."""
     from vio.calibration.findings import NotObservable
 
-    return [(name, str(found))] if isinstance(found, NotObservable) else rows(found)
+    if isinstance(found, NotObservable):
+        return [(name, str(found))]
+    return rows(found)
 
 
 def _intrinsics_rows(found: Intrinsics) -> _Rows:

@@ -320,7 +320,9 @@ def _rows(found: CameraCalibration) -> list[tuple[str, str]]:
         rows.append(
             ("", f"{rival.name} explains them as well, and differs by {worst:.2f} px at worst")
         )
-    names = ("left", "right") if len(at.cameras) > 1 else ("camera",)
+    names: tuple[str, ...] = ("camera",)
+    if len(at.cameras) > 1:
+        names = ("left", "right")
     for c, (name, camera) in enumerate(zip(names, at.cameras, strict=True)):
         own = sigma[layout.lenses[c]]
         values = zip(

@@ -37,7 +37,10 @@ def execute(args: argparse.Namespace) -> int:
         print(to_yaml(config), end="")
         return 0
     rows = list(describe(config))
-    shown = rows if args.all else [row for row in rows if row.key in BASIC]
+    if args.all:
+        shown = rows
+    else:
+        shown = [row for row in rows if row.key in BASIC]
     _print_by_group(shown)
     if len(shown) < len(rows):
         print(f"# {len(rows) - len(shown)} more: vio config --all")
@@ -53,7 +56,10 @@ def _print_by_group(rows: Sequence[SettingInfo]) -> None:
 
 def _print_rows(rows: Iterable[SettingInfo]) -> None:
     for row in rows:
-        value = f"{row.default:g}" if isinstance(row.default, float) else str(row.default)
+        if isinstance(row.default, float):
+            value = f"{row.default:g}"
+        else:
+            value = str(row.default)
         unit = f" {row.unit}" if row.unit else ""
         print(f"{row.key} = {value}{unit}")
         lines = textwrap.wrap(row.doc, 100)

@@ -125,7 +125,11 @@ def _recording(args: argparse.Namespace) -> int:
             "files": sorted({MARKER, *(child.name for child in folder.iterdir())}),
         }
         write_text(folder / MARKER, json.dumps(facts, indent=2) + "\n")
-    rows = [("folder", str(args.out)), ("form", args.to), ("frames", f"{done.frames}")]
+    rows = [
+        ("folder", str(args.out)),
+        ("form", args.to),
+        ("frames", f"{done.frames}"),
+    ]
     rows += [("samples", f"{done.imu_samples} of the IMU, {done.velocities} velocities")]
     rows += [("note", note) for note in done.notes]
     return print_result({"out": str(args.out), **facts}, rows, as_json=args.json)
@@ -140,4 +144,6 @@ def _written(out: Path) -> list[str] | None:
         files = json.loads((out / MARKER).read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return [str(name) for name in files] if isinstance(files, list) else None
+    if not isinstance(files, list):
+        return None
+    return [str(name) for name in files]

@@ -201,6 +201,13 @@ def _evaluated(
     return result
 
 
+def _shortened(name: str) -> str:
+    """The end of a name that is too long for the table's column."""
+    if len(name) <= _NAME:
+        return name
+    return "…" + name[1 - _NAME :]
+
+
 def _side_by_side(results: Mapping[str, Evaluation]) -> Iterator[tuple[str, str]]:
     """Yield the main figures of several trajectories as one table, one line each."""
     from vio.evaluation.trajectories import metres_texts
@@ -209,16 +216,22 @@ def _side_by_side(results: Mapping[str, Evaluation]) -> Iterator[tuple[str, str]
     known = [name for name, r in results.items() if r.rpe is not None]
     steps = metres_texts(*(r.rpe.trans_rmse_m for r in results.values() if r.rpe is not None))
     rpes = dict(zip(known, steps, strict=True))
-    names = {name: name if len(name) <= _NAME else "…" + name[1 - _NAME :] for name in results}
+    names = {name: _shortened(name) for name in results}
     yield (
         "",
         f"{'':<{_NAME}} {'poses':>7} {'ATE':>10} {'attitude':>10} {'scale':>9} {'RPE':>10} "
         f"{'drift':>8}",
     )
     for (name, r), ate in zip(results.items(), ates, strict=True):
-        scale = "–" if r.scale_free is None else f"{100 * (r.scale_free.scale - 1):+.3f} %"
+        if r.scale_free is None:
+            scale = "–"
+        else:
+            scale = f"{100 * (r.scale_free.scale - 1):+.3f} %"
         rpe = rpes.get(name, "–")
-        drift = "–" if r.kitti is None else f"{r.kitti.t_err_percent:.3f} %"
+        if r.kitti is None:
+            drift = "–"
+        else:
+            drift = f"{r.kitti.t_err_percent:.3f} %"
         figures = (
             f"{r.matched:>7} {ate:>10} {r.ate_deg.rmse:>6.3f} deg {scale:>9} {rpe:>10} {drift:>8}"
         )
@@ -236,7 +249,9 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
         f"{result.matched_path_length_m:.3f} m, the reference's "
         f"{result.reference_path_length_m:.3f} m",
     )
-    scale = f", scale {result.scale:.6f}" if result.align == "sim3" else ""
+    scale = ""
+    if result.align == "sim3":
+        scale = f", scale {result.scale:.6f}"
     yield "alignment", _ALIGNMENTS[result.align] + scale
     small = result.ate_m.rmse < 0.01
     yield "ATE", _errors_text(result.ate_m, *((1e3, "mm") if small else (1.0, "m")))
@@ -271,7 +286,9 @@ def _errors_text(errors: ErrorStatistics, factor: float, unit: str) -> str:
 
 
 def _length_text(length_m: float, *, small: bool) -> str:
-    return f"{1e3 * length_m:.4g} mm" if small else f"{length_m:.4g} m"
+    if small:
+        return f"{1e3 * length_m:.4g} mm"
+    return f"{length_m:.4g} m"
 
 
 def _drift_rows(drift: KittiError) -> Iterator[tuple[str, str]]:

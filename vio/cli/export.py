@@ -57,7 +57,9 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    return _colmap(args) if args.form == "colmap" else _bag(args)
+    if args.form == "colmap":
+        return _colmap(args)
+    return _bag(args)
 
 
 def _bag(args: argparse.Namespace) -> int:

@@ -68,7 +68,10 @@ def execute(args: argparse.Namespace) -> int:
     if not math.isfinite(args.time_offset) or abs(args.time_offset) > 4e9:
         raise ConfigError(f"--time-offset takes seconds, got {args.time_offset:g}")
     of = placed(args.path)
-    fixes = None if is_map(args.gnss) else read_gnss(args.gnss, args.topic)
+    if is_map(args.gnss):
+        fixes = None
+    else:
+        fixes = read_gnss(args.gnss, args.topic)
     for note in () if fixes is None else fixes.notes:
         logging.getLogger(__name__).log(NOTE, "%s", note)
     is_run = args.path.is_dir()
@@ -106,7 +109,9 @@ def _lever_arm(text: str) -> FloatArray:
 
 def _usual_folder(path: Path) -> Path:
     """Return the folder of the results: in a run's folder, or beside a map."""
-    return path / "earth" if path.is_dir() else path.with_name(f"{path.name}.earth")
+    if path.is_dir():
+        return path / "earth"
+    return path.with_name(f"{path.name}.earth")
 
 
 def _rows(f: dict[str, Any]) -> list[tuple[str, str]]:

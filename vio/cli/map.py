@@ -176,7 +176,9 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
         joined = "" if session["joined"] else "; not joined to the first session"
         path = f"{session['keyframes']} keyframes, path {session['path_m']:.1f} m"
         c = session["camera"]
-        size = f"{c['width']}x{c['height']} px, " if c["width"] else ""
+        size = ""
+        if c["width"]:
+            size = f"{c['width']}x{c['height']} px, "
         rig = f"{size}f {c['fu']:.1f} px, baseline {c['baseline_m']:.4g} m"
         rows.append((f"session {number}", f"{session['source']}: {path}; {rig}{joined}"))
     return rows

@@ -125,7 +125,10 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     sigmas = ", ".join(
         f"{1e3 * sigma:.0f} mm at {z} m" for z, sigma in facts["depth_sigma_m"].items()
     )
-    stopped = "" if facts["stopped"] is None else f" of {facts['chosen']}, {facts['stopped']}"
+    if facts["stopped"] is None:
+        stopped = ""
+    else:
+        stopped = f" of {facts['chosen']}, {facts['stopped']}"
     return [
         ("folder", facts["out"]),
         (

@@ -74,7 +74,8 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
     def update(self, done: int, total: int | None = None) -> None:
         """Set the number of steps done, and optionally the total."""
         if self._bar is not None:
-            self._bar.total = self._bar.total if total is None else total
+            if total is not None:
+                self._bar.total = total
             self._bar.update(done - self._bar.n)
         self._total = self._total if total is None else total
         self._advance_to(done)

@@ -129,7 +129,10 @@ def execute(args: argparse.Namespace) -> int:
     start = time.perf_counter()
     simulation = plan(scenario)
     frames = len(simulation.stamps_ns)
-    workers = default_workers(frames) if args.workers is None else args.workers
+    if args.workers is None:
+        workers = default_workers(frames)
+    else:
+        workers = args.workers
 
     def write(recording: SimulatedRecording) -> None:
         with ProgressBar(f"rendering the {scenario.scene}") as bar:
@@ -251,7 +254,8 @@ def _flight(args: argparse.Namespace) -> tuple[Any, Any, Any]:
         trajectory = Path(trajectory)
         if trajectory.is_dir():
             trajectory, own_times, own_imu = flight_files(trajectory)
-            frame_times = own_times if frame_times is None and args.rate is None else frame_times
+            if frame_times is None and args.rate is None:
+                frame_times = own_times
             imu = own_imu if imu is None else imu
         elif not trajectory.exists():
             raise ConfigError(
@@ -287,7 +291,10 @@ def _conditions(args: argparse.Namespace) -> Conditions:
     from vio.sim.scenarios import Conditions, conditions_of, real_conditions
 
     real = args.realism != "plain"
-    level = real_conditions(args.scene, drawn_rig=args.realism == "drawn") if real else Conditions()
+    if real:
+        level = real_conditions(args.scene, drawn_rig=args.realism == "drawn")
+    else:
+        level = Conditions()
     conditions = conditions_of(
         [name.strip() for name in args.effects.split(",") if name.strip()], level
     )

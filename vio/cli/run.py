@@ -131,7 +131,9 @@ def execute(args: argparse.Namespace) -> int:
         command=args.command_line,
     )
     metrics = process(args.source, config_from(args), options, shown)
-    return _reported(Path(metrics["out"]), args) if args.report else 0
+    if not args.report:
+        return 0
+    return _reported(Path(metrics["out"]), args)
 
 
 def _check_combinations(args: argparse.Namespace) -> None:

@@ -283,7 +283,9 @@ def _samples_between(
         return motion.take(inside)
     span = slice(int(inside.argmax()), len(inside) - int(inside[::-1].argmax()))
     around = motion.take(span)  # no copy of an hour of samples, where all of them belong to it
-    return around if inside[span].all() else around.take(inside[span])
+    if inside[span].all():
+        return around
+    return around.take(inside[span])
 
 
 def npz_names(path: Path) -> frozenset[str]:

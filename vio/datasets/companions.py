@@ -78,7 +78,9 @@ def calibration_beside(layout: Layout) -> Path | None:
 
 def _folders_of_calibrations(layout: Layout) -> list[Path]:
     """Return where a recording's calibration may lie: in it, above it, or beside all of its rig."""
-    above = [layout.root.parent] if layout.root.name == "mav0" else []
+    above = []
+    if layout.root.name == "mav0":
+        above = [layout.root.parent]
     own = dict.fromkeys((layout.root, layout.base, *above))
     folders = [base / inside for base in own for inside in _CALIBRATION_FOLDERS]
     shared = layout.root.absolute().parent
@@ -144,11 +146,14 @@ def parts_of(
         beside: what was read beside the images.
         has_body: whether the pose of an IMU is known.
     """
+    T_cam0_imu = None
+    if has_body:
+        T_cam0_imu = rectifier.T_rect0_imu
     recording = Recording(
         kind=kind,
         path=layout.root,
         camera=rectifier.camera,
-        T_cam0_imu=rectifier.T_rect0_imu if has_body else None,
+        T_cam0_imu=T_cam0_imu,
         frame_times_ns=times_ns,
         has_images=True,
         motion=beside.motion.kinds,

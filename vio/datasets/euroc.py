@@ -89,7 +89,10 @@ def read_euroc(path: Path, settings: DatasetSettings) -> ImageDataset:
     folders = [mav / name for name in ("cam0", "cam1", "imu0")]
     read = [folder / file for folder in folders for file in ("sensor.yaml", "data.csv")]
     layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
-    reference = None if truth is None else _read_reference(truth, T_body_imu, rig.T_imu_cam0)
+    if truth is None:
+        reference = None
+    else:
+        reference = _read_reference(truth, T_body_imu, rig.T_imu_cam0)
     beside = Beside(
         samples,
         imu_notes,

@@ -133,7 +133,9 @@ def imu_yaml(T_body_imu: FloatArray, noise: ImuDensities, *, comment: str, rate_
 
 def median_rate_hz(times_ns: IntArray) -> float:
     """Return the median rate of sample times (N,); 0 for a single time."""
-    return NS_PER_S / float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
+    if len(times_ns) > 1:
+        return NS_PER_S / float(np.median(np.diff(times_ns)))
+    return 0.0
 
 
 def _T_BS(entries: Mapping[str, object], path: Path) -> FloatArray:

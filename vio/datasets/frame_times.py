@@ -174,4 +174,6 @@ def nearest(of: IntArray, among: IntArray) -> IntArray:
     after = np.clip(np.searchsorted(among, of), 1, max(len(among) - 1, 1))
     after = np.minimum(after, len(among) - 1)
     before = np.maximum(after - 1, 0)
-    return np.where(np.abs(among[after] - of) < np.abs(of - among[before]), after, before)
+    to_after = np.abs(among[after] - of)
+    to_before = np.abs(of - among[before])
+    return np.where(to_after < to_before, after, before)

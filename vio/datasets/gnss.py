@@ -51,7 +51,10 @@ def _read_csv(path: Path) -> GnssFixes:
     ):
         raise DataError(f"{path}: has the columns {','.join(table.header)}; expected {_FORM}")
     values = table.values
-    sigmas = values[:, 3:].copy() if columns == 7 else np.full((len(values), 3), np.nan)
+    if columns == 7:
+        sigmas = values[:, 3:].copy()
+    else:
+        sigmas = np.full((len(values), 3), np.nan)
     no_up = np.isnan(sigmas[:, 2])
     sigmas[no_up, 2] = UP_SHARE * sigmas[no_up, :2].max(axis=1)
     times_ns = check_increasing(stamps_ns(table), table.where)

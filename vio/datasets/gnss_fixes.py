@@ -52,7 +52,10 @@ def checked_fixes(
     order = np.argsort(times_ns, kind="stable")
     times_ns = times_ns[order]
     geodetic = geodetic[order]
-    C = np.full((len(order), 3, 3), np.nan) if covariance is None else covariance[order]
+    if covariance is None:
+        C = np.full((len(order), 3, 3), np.nan)
+    else:
+        C = covariance[order]
     keep = np.isfinite(geodetic[:, :2]).all(axis=1) & np.concatenate(
         [[True], np.diff(times_ns) > 0]
     )

@@ -70,6 +70,9 @@ def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDa
     refuse_swapped(tracks, file)
     times_ns: IntArray = (numbers - numbers[0]) * DRIVE_NS
     poses_file = _beside(file, "camera_poses")
+    reference = None
+    if poses_file is not None:
+        reference = _reference(poses_file, numbers, times_ns)
     recording = Recording(
         kind="gtsam",
         path=path,
@@ -78,7 +81,7 @@ def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDa
         frame_times_ns=times_ns,
         has_images=False,
         motion=frozenset(),
-        reference=None if poses_file is None else _reference(poses_file, numbers, times_ns),
+        reference=reference,
         notes=(
             f"{file.name} states no times; frames are taken to be {DRIVE_NS * 1e-9:g} s apart, so "
             "speeds are unknown",
@@ -155,7 +158,10 @@ def _reference(path: Path, numbers: IntArray, times_ns: IntArray) -> Trajectory:
     poses = table[:, 1:].reshape(-1, 4, 4)
     own = table[:, 0]
     for row, T in enumerate(poses):
-        fault = "values are not finite" if not np.isfinite(table[row]).all() else rigid_fault(T)
+        if np.isfinite(table[row]).all():
+            fault = rigid_fault(T)
+        else:
+            fault = "values are not finite"
         if row and not own[row] > own[row - 1]:
             fault = "its number does not increase"
         if fault:

@@ -135,7 +135,10 @@ def gray_levels(pairs: ImagePairs) -> tuple[Levels, tuple[str, ...]]:
     where they are not 0 and 65535, and where the images look like raw ones of a colour camera.
     """
     last = len(pairs) - 1
-    chosen = {last * k // (LEVEL_IMAGES - 1) for k in range(LEVEL_IMAGES)} if pairs else set()
+    if pairs:
+        chosen = {last * k // (LEVEL_IMAGES - 1) for k in range(LEVEL_IMAGES)}
+    else:
+        chosen = set()
     levels = levels_in([path for k in sorted(chosen) for path in pairs[k]])
     return levels, (*levels.note, *_mosaic_notes(pairs), *_turn_notes(pairs))
 
@@ -236,7 +239,10 @@ class ImageRecording(ABC):
                 the settings allow.
         """
         chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
-        frames = self._frames(chosen) if images else blank_frames(self.recording, chosen)
+        if images:
+            frames = self._frames(chosen)
+        else:
+            frames = blank_frames(self.recording, chosen)
         return merge_events(self.recording, chosen, self.motion, frames)
 
     def frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:

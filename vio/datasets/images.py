@@ -289,7 +289,9 @@ def _jpeg_damage(data: bytes) -> str | None:
             if data.rstrip(b"\0").endswith(_JPEG_END):
                 return None
             at = _end_of_scan(data, at)
-    return None if at >= 0 and data[at : at + 2] == _JPEG_END else "the JPEG is truncated"
+    if at >= 0 and data[at : at + 2] == _JPEG_END:
+        return None
+    return "the JPEG is truncated"
 
 
 def _end_of_scan(data: bytes, at: int) -> int:
@@ -361,7 +363,12 @@ def natural_key(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
     seconds = re.fullmatch(r"(.*?)(\d{9,10})\.(\d{1,9})", stem_of(name))
     if seconds is not None:
         fraction = seconds[3].ljust(9, "0")
-        return ((-1, seconds[1]), (int(seconds[2]), ""), (-1, "."), (int(fraction), "")), name
+        return (
+            (-1, seconds[1]),
+            (int(seconds[2]), ""),
+            (-1, "."),
+            (int(fraction), ""),
+        ), name
     parts = re.split(r"(\d+)", stem_of(name))
     return tuple((int(p), "") if k % 2 else (-1, p) for k, p in enumerate(parts)), name
 
@@ -408,7 +415,9 @@ def other_damage(data: bytes) -> str | None:
     if data.startswith(b"BM") and len(data) >= 6:
         return "the BMP is truncated" if _size_at(data, 2) > len(data) else None
     if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-        return "the WebP is truncated" if _size_at(data, 4) + 8 > len(data) else None
+        if _size_at(data, 4) + 8 > len(data):
+            return "the WebP is truncated"
+        return None
     if data[:2] in _NETPBM:
         return _netpbm_damage(data)
     if data.startswith(_TIFF_STARTS):

@@ -116,7 +116,10 @@ def _transform(
 ) -> FloatArray:
     """Return the transform (4, 4) of two entries, or of a rotation alone."""
     R = _entry(entries, rotation, 9, path).reshape(3, 3)
-    t = np.zeros(3) if translation is None else _entry(entries, translation, 3, path)
+    if translation is None:
+        t = np.zeros(3)
+    else:
+        t = _entry(entries, translation, 3, path)
     return checked_transform(np.column_stack([R, t]), f"{path}, {rotation}")
 
 

@@ -65,7 +65,9 @@ def band_of(pixels: npt.NDArray[Any]) -> Band:
     dead ones, do not count below.
     """
     seen = pixels[pixels > 0]
-    low = float(np.quantile(seen, 1 - _LEVELS.bright_share)) if seen.size else 0.0
+    low = 0.0
+    if seen.size:
+        low = float(np.quantile(seen, 1 - _LEVELS.bright_share))
     return low, float(np.quantile(pixels, _LEVELS.bright_share))
 
 
@@ -93,9 +95,15 @@ def levels_of(bands: Iterable[Band]) -> Levels:
 def to_8_bits(pixels: npt.NDArray[Any], levels: Levels) -> Image:
     """Return pixels of 8 or 16 bits as uint8; of 16 bits, the levels become 0 and 255."""
     if pixels.dtype.itemsize == 2:
-        above = pixels if levels.black == 0 else pixels.astype(np.float64) - levels.black
+        if levels.black == 0:
+            above = pixels
+        else:
+            above = pixels.astype(np.float64) - levels.black
         scaled = np.rint(above / ((levels.white - levels.black) / 255))
-        pixels = np.minimum(scaled, 255) if levels.black == 0 else np.clip(scaled, 0, 255)
+        if levels.black == 0:
+            pixels = np.minimum(scaled, 255)
+        else:
+            pixels = np.clip(scaled, 0, 255)
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
 

@@ -256,13 +256,18 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
     offsets = arrays["offsets"]
     times_ns = arrays["frame_times_ns"]
     dense_offsets = offsets[np.searchsorted(frames, np.arange(len(times_ns) + 1))]
-    sigma = arrays["sigma"].astype(np.float32) if "sigma" in arrays else None
+    sigma = None
+    if "sigma" in arrays:
+        sigma = arrays["sigma"].astype(np.float32)
     tracks = FeatureTracks(
         dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"], sigma
     )
     motion = MotionSamples[MotionSample](
         arrays["motion_times_ns"], arrays["motion_values"], arrays["motion_is_imu"]
     )
+    run_motion = None
+    if "run_motion" in arrays:
+        run_motion = cast(RunMotion, str(arrays["run_motion"]))
     recording = Recording(
         kind="log",
         path=path,
@@ -274,7 +279,7 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
         reference=_reference(arrays),
         landmarks_reference=_landmarks(arrays),
         notes=tuple(str(note) for note in arrays["notes"]),
-        run_motion=cast(RunMotion, str(arrays["run_motion"])) if "run_motion" in arrays else None,
+        run_motion=run_motion,
         image_numbers=arrays.get("image_numbers"),
     )
     return FeatureDataset(recording, tracks, motion, frames)

@@ -57,7 +57,9 @@ def decode_gray8(data: bytes) -> Image | None:
         elif kind == b"IHDR" and length == 13:
             size = _size_of_gray_8(data, at + 8)
         elif kind == b"IEND":
-            return None if size is None else _pixels(b"".join(parts), *size)
+            if size is None:
+                return None
+            return _pixels(b"".join(parts), *size)
         elif kind not in _PASSED_OVER:
             return None
         if size is None:

@@ -187,7 +187,8 @@ def _jump(tracks: FeatureTracks, previous: IntArray, carried: BoolArray) -> floa
     c = c[fits]
     b = b[fits]
     a = a[fits]
-    before = np.linalg.norm(tracks.z[a, :2] - tracks.z[previous[a], :2], axis=1)
+    flow_px = tracks.z[a, :2] - tracks.z[previous[a], :2]
+    before = np.linalg.norm(flow_px, axis=1)
     after = np.linalg.norm(tracks.z[c, :2] - tracks.z[b, :2], axis=1)
     clear = before >= 1.0
     if clear.sum() < _REPEATS.min_jumps:
@@ -212,7 +213,10 @@ def resolve_repeats(
     )
     if mode == "literal":
         return tracks, (f"{note}; used as they are, as requested",)
-    jump = "" if found.jump is None else f" (pixels move {found.jump:.2f} steps afterwards"
+    if found.jump is None:
+        jump = ""
+    else:
+        jump = f" (pixels move {found.jump:.2f} steps afterwards"
     changed = found.jump is not None and found.jump < _REPEATS.jump_steps
     if mode == "flag" or (mode == "auto" and not changed):
         return marked, (f"{note}; they are flagged{jump and jump + ')'}",)

@@ -46,7 +46,9 @@ def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
     if photometric:
         why = "photometric calibration is not applied, as the tracks gain nothing by it"
         notes.append(f"{why}: {listed(photometric)}")
-    return [*notes, f"not used: {listed(others)}"] if others else notes
+    if others:
+        return [*notes, f"not used: {listed(others)}"]
+    return notes
 
 
 def _kept(layout: Layout, used: Sequence[Path]) -> set[Path]:
@@ -92,7 +94,9 @@ def _fits(name: str, patterns: Sequence[str]) -> bool:
 def listed(names: Sequence[str]) -> str:
     """Return the first names, and how many more there are."""
     shown = ", ".join(names[:_NAMED]) or "none"
-    return f"{shown} and {len(names) - _NAMED} more" if len(names) > _NAMED else shown
+    if len(names) > _NAMED:
+        return f"{shown} and {len(names) - _NAMED} more"
+    return shown
 
 
 def _belongs(other: Path, calibration: Path) -> bool:
@@ -114,7 +118,10 @@ def unread_files(path: Path) -> str | None:
     """Say what to do with archives, or with images of another form, which a path is or a folder and
     the folders in it hold; None: there are none.
     """
-    files = [path] if path.is_file() else [*path.glob("*.*"), *path.glob("*/*.*")]
+    if path.is_file():
+        files = [path]
+    else:
+        files = [*path.glob("*.*"), *path.glob("*/*.*")]
     archive = next((file for file in files if file.suffix.lower() in ARCHIVES), None)
     if archive is not None:
         inside = Path(archive.stem).suffix.lower() in (".db3", ".mcap", ".bag")

@@ -77,7 +77,9 @@ def video_files(path: Path) -> tuple[Path, Path] | None:
         return alone, alone
     pairs = pairs_of(list(found))
     known = [pair for pair in pairs if pair in _NAMES] or pairs
-    return (found[known[0][0]], found[known[0][1]]) if len(known) == 1 else None
+    if len(known) == 1:
+        return (found[known[0][0]], found[known[0][1]])
+    return None
 
 
 def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
@@ -106,7 +108,10 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     layout = Layout(path, path, *files)
     file = settings.calibration or find_calibration_of(layout)
     one = files[0] == files[1]
-    size = (left.width // 2, left.height) if one else (left.width, left.height)
+    if one:
+        size = (left.width // 2, left.height)
+    else:
+        size = (left.width, left.height)
     rig = load_rig(file, image_size=size, cameras=2)
     if one:
         _check_side_by_side(rig, left, files[0], file)
@@ -165,7 +170,9 @@ def _stated_times(file: Path) -> IntArray | None:
     finally:
         packets.release()
     times_ns = np.rint(1e6 * np.sort(times_ms)).astype(np.int64)  # packets are in decoding order
-    return times_ns if len(times_ns) > 1 and np.diff(times_ns).min() > 0 else None
+    if len(times_ns) > 1 and np.diff(times_ns).min() > 0:
+        return times_ns
+    return None
 
 
 def _is_even(times_ns: IntArray, rate_hz: float) -> bool:
@@ -229,7 +236,10 @@ def _uneven_times(
             "frame into times.txt beside them"
         )
     times_ns = left_ns[rows[:, 0]]
-    apart_ms = 1e-6 * np.diff(times_ns) if len(times_ns) > 1 else np.zeros(1)
+    if len(times_ns) > 1:
+        apart_ms = 1e-6 * np.diff(times_ns)
+    else:
+        apart_ms = np.zeros(1)
     notes = [
         f"no times.txt: frames have the presentation times of {files[0].name}, "
         f"{apart_ms.min():.3g} to {apart_ms.max():.3g} ms apart"

@@ -66,8 +66,10 @@ def _view(course: FloatArray) -> FloatArray:
 
 def _along(path: FloatArray, step_m: float) -> FloatArray:
     """Return points at most a step apart along a path (N, 3)."""
-    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    at = np.linspace(0.0, lengths[-1], min(int(lengths[-1] / step_m) + 2, 200_000))
+    steps_m = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    lengths = np.concatenate([[0.0], np.cumsum(steps_m)])
+    count = min(int(lengths[-1] / step_m) + 2, 200_000)
+    at = np.linspace(0.0, lengths[-1], count)
     return np.stack([np.interp(at, lengths, path[:, k]) for k in range(3)], axis=1)
 
 
@@ -97,13 +99,17 @@ def _splat(q: FloatArray, colours: FloatArray, size_m: FloatArray, inside: int) 
     q = q[ahead_of]
     colours = colours[ahead_of]
     size_m = size_m[ahead_of]
-    u = np.rint(focal * q[:, 0] / q[:, 2] + _VIEW.width / 2).astype(int)
-    v = np.rint(focal * q[:, 1] / q[:, 2] + _VIEW.height / 2).astype(int)
-    reach = np.clip(np.ceil(0.5 * focal * size_m / q[:, 2]).astype(int), 0, 12)
-    shown = (u >= 0) & (v >= 0) & (u < _VIEW.width) & (v < _VIEW.height)
+    depth = q[:, 2]
+    u = np.rint(focal * q[:, 0] / depth + _VIEW.width / 2).astype(int)
+    v = np.rint(focal * q[:, 1] / depth + _VIEW.height / 2).astype(int)
+    half_px = 0.5 * focal * size_m / depth
+    reach = np.clip(np.ceil(half_px).astype(int), 0, 12)
+    in_columns = (u >= 0) & (u < _VIEW.width)
+    in_rows = (v >= 0) & (v < _VIEW.height)
+    shown = in_columns & in_rows
     for row in np.flatnonzero(shown).tolist():
         r = reach[row]
-        image[max(v[row] - r, 0) : v[row] + r + 1, max(u[row] - r, 0) : u[row] + r + 1] = colours[
-            row
-        ]
+        rows = slice(max(v[row] - r, 0), v[row] + r + 1)
+        columns = slice(max(u[row] - r, 0), u[row] + r + 1)
+        image[rows, columns] = colours[row]
     return image

@@ -105,7 +105,8 @@ def slant(depth: DepthImage, camera: StereoCamera) -> DepthImage:
         here = tuple(inner)
         there = tuple(ahead)
         both = (known[here] > 0) & (known[there] > 0)
-        difference = np.where(both, inverse[there] - inverse[here], np.inf).astype(np.float32)
+        change = inverse[there] - inverse[here]
+        difference = np.where(both, change, np.inf).astype(np.float32)
         step[here] = difference
         closer = np.abs(difference) < np.abs(step[there])
         step[there][closer] = difference[closer]

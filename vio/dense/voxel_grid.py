@@ -108,7 +108,10 @@ class VoxelGrid:
         if not len(keys):
             return
         slots = self._slots(keys, T_world_cam[:3, 3])
-        colour = image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
+        if image.ndim == 3:
+            colour = image
+        else:
+            colour = np.repeat(image[:, :, None], 3, axis=2)
         pool = self._pool
         lengths = np.array(
             [
@@ -209,7 +212,10 @@ class VoxelGrid:
             self._make_room(len(missing), set(wanted), centre)
         for key in missing:
             slot = self._free.pop()
-            self._pool[slot] = self._read(key) if key in self._kept else np.zeros((), dtype=BLOCK)
+            if key in self._kept:
+                self._pool[slot] = self._read(key)
+            else:
+                self._pool[slot] = np.zeros((), dtype=BLOCK)
             self._slot[key] = slot
         return np.array([self._slot[key] for key in wanted], dtype=np.int64)
 

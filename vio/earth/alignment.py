@@ -100,7 +100,8 @@ def heading_deg(T_enu_map: FloatArray, covariance: FloatArray) -> tuple[float, f
     """
     R = T_enu_map[:3, :3]
     heading = np.arctan2(R[1, 0], R[0, 0])
-    sigma = np.sqrt((R @ covariance[3:, 3:] @ R.T)[2, 2])
+    P_world = R @ covariance[3:, 3:] @ R.T
+    sigma = np.sqrt(P_world[2, 2])
     return float(np.degrees(heading)), float(np.degrees(sigma))
 
 
@@ -122,7 +123,7 @@ def georeference(
     before, share, inside = _between(path, fixes.times_ns + time_offset_ns)
     if int(inside.sum()) < _ALIGNMENT.min_fixes:
         own_ns = fixes.times_ns + time_offset_ns
-        spans = [f"{t[0] * 1e-9:.3f} to {t[-1] * 1e-9:.3f} s" for t in (own_ns, path.times_ns)]
+        spans = [_span_text(times_ns) for times_ns in (own_ns, path.times_ns)]
         raise EstimationError(
             f"only {int(inside.sum())} GNSS positions ({spans[0]}) are within the trajectory "
             f"({spans[1]}); give "
@@ -169,6 +170,12 @@ def georeference(
     )
 
 
+def _span_text(times_ns: IntArray) -> str:
+    begin_s = times_ns[0] * 1e-9
+    end_s = times_ns[-1] * 1e-9
+    return f"{begin_s:.3f} to {end_s:.3f} s"
+
+
 def _between(path: Path, times_ns: IntArray) -> tuple[IntArray, FloatArray, BoolArray]:
     """Return the pose before each time (N,), its share of the way to the next one, and whether
     it is between two.
@@ -182,9 +189,10 @@ def _between(path: Path, times_ns: IntArray) -> tuple[IntArray, FloatArray, Bool
         if len(own) < 2:
             continue
         here = (times_ns >= own[0]) & (times_ns <= own[-1]) & ~inside
-        k = np.clip(np.searchsorted(own, times_ns[here], side="right") - 1, 0, len(own) - 2)
+        asked_ns = times_ns[here]
+        k = np.clip(np.searchsorted(own, asked_ns, side="right") - 1, 0, len(own) - 2)
         before[here] = start + k
-        share[here] = (times_ns[here] - own[k]) / (own[k + 1] - own[k])
+        share[here] = (asked_ns - own[k]) / (own[k + 1] - own[k])
         inside |= here
     return before, share, inside
 
@@ -213,10 +221,12 @@ class _Problem:
         self._j = np.concatenate([k + 1, path.second])
         self._T_i_j = se3_inverse(path.T_map_body[self._i]) @ path.T_map_body[self._j]
         length = np.linalg.norm(self._T_i_j[:, :3, 3], axis=1)
-        root = np.sqrt(length + np.linalg.norm(se3_log(self._T_i_j)[:, 3:], axis=1))
+        turned_rad = np.linalg.norm(se3_log(self._T_i_j)[:, 3:], axis=1)
+        root = np.sqrt(length + turned_rad)
         sigma_m = np.maximum(_ALIGNMENT.drift_m * root, _ALIGNMENT.min_m)
         sigma_rad = np.maximum(_DRIFT_RAD * root, _ALIGNMENT.min_rad)
-        self._edge_weight = 1 / np.repeat(np.stack([sigma_m, sigma_rad], axis=1), 3, axis=1) ** 2
+        sigmas = np.stack([sigma_m, sigma_rad], axis=1)
+        self._edge_weight = 1 / np.repeat(sigmas, 3, axis=1) ** 2
         self._up_body = path.up_map @ path.T_map_body[:, :3, :3]
         covariance = covariance + _ALIGNMENT.timing_m**2 * np.eye(3)
         self._horizontal = np.linalg.inv(covariance[:, :2, :2])
@@ -296,7 +306,9 @@ class _Problem:
     ) -> tuple[FloatArray, float, float]:
         H, g = self._normal(T, log_scale, weight)
         x = _Factors(H).solve(g[:, None])[:, 0]
-        return T @ se3_exp(x[:-1].reshape(-1, 6)), log_scale + float(x[-1]), float(np.abs(x).max())
+        moved = T @ se3_exp(x[:-1].reshape(-1, 6))
+        largest_step = float(np.abs(x).max())
+        return moved, log_scale + float(x[-1]), largest_step
 
     def _normal(
         self, T: FloatArray, log_scale: float, weight: FloatArray
@@ -325,9 +337,11 @@ class _Problem:
 
         scaled = self._T_i_j.copy()
         scaled[:, :3, 3] *= np.exp(log_scale)
-        r = se3_log(se3_inverse(scaled) @ se3_inverse(T[self._i]) @ T[self._j])
+        predicted = se3_inverse(scaled) @ se3_inverse(T[self._i])
+        r = se3_log(predicted @ T[self._j])
         r_D_j = np.asarray(np.linalg.inv(se3_left_jacobian(-r)), dtype=np.float64)
-        r_D_i: FloatArray = -r_D_j @ se3_adjoint(se3_inverse(T[self._j]) @ T[self._i])
+        T_j_i = se3_inverse(T[self._j]) @ T[self._i]
+        r_D_i: FloatArray = -r_D_j @ se3_adjoint(T_j_i)
         # A longer motion is T_i_j exp([R^T t ds; 0]) before what follows it: minus the left
         # Jacobian's inverse.
         r_D_scale = np.zeros((len(r), 6, 1))
@@ -346,14 +360,16 @@ class _Problem:
         W = np.zeros((len(p), 3, 3))
         W[:, :2, :2] = self._horizontal * weight[:, 0, None, None]
         W[:, 2, 2] = self._vertical * weight[:, 1]
-        move = T[:, :3, :3] @ np.concatenate([np.eye(3), -so3_hat(self._lever)], axis=1)
+        antenna_D_pose = np.concatenate([np.eye(3), -so3_hat(self._lever)], axis=1)
+        move = T[:, :3, :3] @ antenna_D_pose
         J = [-(1 - share) * move[k], -share * move[k + 1]]
         add([6 * k, 6 * k + 6], J, p, self._independent * W)
         up = T[:, 2, :3]
         D = np.zeros((count, 3, 6))
         D[:, :, 3:] = so3_hat(up)
         # The vertical has one error in all poses: so many count as one.
-        tilt = np.broadcast_to(np.eye(3) / (self._path.up_sigma_rad**2 * count), (count, 3, 3))
+        variance = self._path.up_sigma_rad**2 * count
+        tilt = np.broadcast_to(np.eye(3) / variance, (count, 3, 3))
         add([6 * np.arange(count)], [D], up - self._up_body, tilt)
         if not weight[:, 1].any():
             rise = np.zeros((1, 1, 6))
@@ -389,7 +405,8 @@ class _Factors:
             raise EstimationError(unknown) from error
         self._border = H[:-1, -1:].toarray()
         self._solved = self._rest(self._border)
-        self._last = float(H[-1, -1] - (self._border.T @ self._solved)[0, 0])
+        eliminated = self._border.T @ self._solved
+        self._last = float(H[-1, -1] - eliminated[0, 0])
         if not self._last > 0:  # NaN, too
             raise EstimationError(unknown)
 
@@ -404,7 +421,8 @@ def _start(p: FloatArray, measured: FloatArray, up: FloatArray) -> FloatArray:
     """Return the transform (4, 4) of points (N, 3) to others that fits most, with `up` (3,) as
     z, reweighted.
     """
-    side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    least_along = int(np.argmin(np.abs(up)))
+    side = np.cross(up, np.eye(3)[least_along])
     side /= np.linalg.norm(side)
     level = np.stack([side, np.cross(up, side), up])
     p = p @ level.T
@@ -416,11 +434,20 @@ def _start(p: FloatArray, measured: FloatArray, up: FloatArray) -> FloatArray:
         mean_m = share @ measured
         q = (p - mean_p)[:, :2]
         m = share[:, None] * (measured - mean_m)[:, :2]
-        yaw = np.arctan2(np.sum(q[:, 0] * m[:, 1] - q[:, 1] * m[:, 0]), np.sum(q * m))
-        R = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
+        crossed = q[:, 0] * m[:, 1] - q[:, 1] * m[:, 0]
+        yaw = np.arctan2(np.sum(crossed), np.sum(q * m))
+        R = np.array(
+            [
+                [np.cos(yaw), -np.sin(yaw), 0],
+                [np.sin(yaw), np.cos(yaw), 0],
+                [0, 0, 1.0],
+            ]
+        )
         T = se3_from_parts(R @ level, mean_m - R @ mean_p)
-        off = np.linalg.norm((measured - p @ R.T - T[:3, 3])[:, :2], axis=1)
-        weight = 1 / (1 + (off / max(2 * float(np.median(off)), 1e-3)) ** 2)
+        residual_m = measured - p @ R.T - T[:3, 3]
+        off = np.linalg.norm(residual_m[:, :2], axis=1)
+        usual_m = max(2 * float(np.median(off)), 1e-3)
+        weight = 1 / (1 + (off / usual_m) ** 2)
     return T
 
 
@@ -451,7 +478,8 @@ def _position_covariances(normal: _Factors, T: FloatArray) -> FloatArray:
         unit = np.zeros((6 * count + 1, 3))
         unit[6 * k : 6 * k + 3] = np.eye(3)
         R = T[k, :3, :3]
-        out[n] = R @ normal.solve(unit)[6 * k : 6 * k + 3] @ R.T
+        column = normal.solve(unit)
+        out[n] = R @ column[6 * k : 6 * k + 3] @ R.T
     at = np.arange(count)
     return np.stack(
         [np.interp(at, rows, out[:, i, j]) for i in range(3) for j in range(3)], axis=1

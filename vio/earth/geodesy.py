@@ -67,8 +67,12 @@ class LocalFrame:
     def _axes(self) -> tuple[FloatArray, FloatArray]:
         lat, lon = np.radians(self.origin[:2])
         east = [-np.sin(lon), np.cos(lon), 0.0]
-        north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
-        up = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
+        sin_lat = np.sin(lat)
+        cos_lat = np.cos(lat)
+        sin_lon = np.sin(lon)
+        cos_lon = np.cos(lon)
+        north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
+        up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
         return np.array([east, north, up]), ecef(self.origin[None])[0]
 
     def enu(self, geodetic: FloatArray) -> FloatArray:
@@ -100,13 +104,16 @@ def utm(geodetic: FloatArray, zone: int) -> FloatArray:
     lat = np.radians(geodetic[:, 0])
     lon = np.radians(geodetic[:, 1] - (6 * zone - 183))
     e = np.sqrt(_E2)
-    t = np.sinh(np.arctanh(np.sin(lat)) - e * np.arctanh(e * np.sin(lat)))
+    sin_lat = np.sin(lat)
+    t = np.sinh(np.arctanh(sin_lat) - e * np.arctanh(e * sin_lat))
     xi = np.arctan2(t, np.cos(lon))
     eta = np.arctanh(np.sin(lon) / np.sqrt(1 + t**2))
     east = eta.copy()
     north = xi.copy()
     for j, alpha in enumerate(_ALPHA, 1):
-        east += alpha * np.cos(2 * j * xi) * np.sinh(2 * j * eta)
-        north += alpha * np.sin(2 * j * xi) * np.cosh(2 * j * eta)
+        xi_j = 2 * j * xi
+        eta_j = 2 * j * eta
+        east += alpha * np.cos(xi_j) * np.sinh(eta_j)
+        north += alpha * np.sin(xi_j) * np.cosh(eta_j)
     north = _K0 * _RADIUS * north + np.where(lat < 0, _NORTH_M, 0.0)
     return np.stack([_EAST_M + _K0 * _RADIUS * east, north], axis=1)

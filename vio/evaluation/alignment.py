@@ -97,7 +97,9 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
     elif d[1] <= _ALIGNMENT.collinear * d[0]:
         R = _rotate_about(U[:, 0], R, _orientation_sum(T_est, T_ref))
         rotation_from = "direction and orientations"
-    scale = float(d @ sign) / x_extent**2 if mode == "sim3" else 1.0
+    scale = 1.0
+    if mode == "sim3":
+        scale = float(d @ sign) / x_extent**2
     return Alignment(R, y_mean - scale * (R @ x_mean), scale, rotation_from)
 
 
@@ -114,14 +116,17 @@ def settle_rotation(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) 
         return alignment
     axis, sigma = deviation_about_path(alignment, T_est, T_ref)
     R = _rotate_about(axis, alignment.R, _orientation_sum(T_est, T_ref))
-    scatter = so3_log(R @ T_est[:, :3, :3] @ np.swapaxes(T_ref[:, :3, :3], 1, 2)) @ axis
+    R_est_ref = R @ T_est[:, :3, :3] @ np.swapaxes(T_ref[:, :3, :3], 1, 2)
+    scatter = so3_log(R_est_ref) @ axis
     angle = np.linalg.norm(so3_log(R @ alignment.R.T))
     precise = sigma > max(
         _ALIGNMENT.loose_rad, _ALIGNMENT.orientation_gain * np.sqrt(np.mean(scatter**2))
     )
     if not precise or angle > _ALIGNMENT.contradiction * sigma:
         return alignment
-    t = T_ref[:, :3, 3].mean(axis=0) - alignment.scale * (R @ T_est[:, :3, 3].mean(axis=0))
+    centre_ref = T_ref[:, :3, 3].mean(axis=0)
+    centre_est = T_est[:, :3, 3].mean(axis=0)
+    t = centre_ref - alignment.scale * (R @ centre_est)
     return Alignment(R, t, alignment.scale, "direction and orientations")
 
 
@@ -138,7 +143,8 @@ def deviation_about_path(
     S = (y - y_mean).T @ (x - x_mean) / len(x)  # symmetric at the least squares
     axis = np.linalg.svd(S)[0][:, 0]
     across = np.eye(3) - np.outer(axis, axis)
-    variance = 0.5 * float(np.mean(np.sum(((y - y_mean - x + x_mean) @ across) ** 2, axis=1)))
+    residual = (y - y_mean - x + x_mean) @ across
+    variance = 0.5 * float(np.mean(np.sum(residual**2, axis=1)))
     curvature = float(np.trace(across @ S))
     return axis, float(np.sqrt(variance / curvature)) if curvature > 0 else float("inf")
 
@@ -153,8 +159,11 @@ def _extent(p: FloatArray) -> float:
     """Root mean square distance from the centroid; 0 where it is within rounding of the
     coordinates.
     """
-    extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
-    return extent if extent > _ALIGNMENT.stationary * float(np.abs(p).max()) else 0.0
+    off_m = p - p.mean(axis=0)
+    extent = float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))
+    if extent > _ALIGNMENT.stationary * float(np.abs(p).max()):
+        return extent
+    return 0.0
 
 
 def _orientation_sum(T_est: FloatArray, T_ref: FloatArray) -> FloatArray:
@@ -166,6 +175,8 @@ def _orientation_sum(T_est: FloatArray, T_ref: FloatArray) -> FloatArray:
 def _rotate_about(axis: FloatArray, R: FloatArray, C: FloatArray) -> FloatArray:
     """Return the rotation `exp(angle axis^) R` that maximises trace(rotation^T C)."""
     D = C @ R.T
-    angle = np.arctan2(-np.trace(so3_hat(axis) @ D), np.trace(D) - axis @ D @ axis)
+    sine = -np.trace(so3_hat(axis) @ D)
+    cosine = np.trace(D) - axis @ D @ axis
+    angle = np.arctan2(sine, cosine)
     out: FloatArray = so3_exp(angle * axis) @ R
     return out

@@ -104,8 +104,10 @@ def associate_times(
     low = np.searchsorted(b, a - max_difference_ns, side="left")
     count = np.searchsorted(b, a + max_difference_ns, side="right") - low
     i = np.repeat(np.arange(len(a)), count)
-    j = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(low, count)
-    order = np.lexsort((j, i, np.abs(a[i] - b[j])))
+    begins = np.repeat(np.cumsum(count) - count, count)
+    j = np.arange(len(i)) - begins + np.repeat(low, count)
+    gap_ns = np.abs(a[i] - b[j])
+    order = np.lexsort((j, i, gap_ns))
     left: list[int] = []  # both stay ascending
     right: list[int] = []
     for row_a, row_b in zip(i[order].tolist(), j[order].tolist(), strict=True):
@@ -131,13 +133,21 @@ def coverage(
         else _frames(reference)
     )
     span = int(clock[-1] - clock[0])
-    gaps = None if estimate.times_ns is None else np.diff(estimate.times_ns[rows])
+    if estimate.times_ns is None:
+        gaps = None
+    else:
+        gaps = np.diff(estimate.times_ns[rows])
+    reference_span = None
+    if span:
+        reference_span = int(clock[reference_rows[-1]] - clock[reference_rows[0]]) / span
+    if gaps is None or len(gaps) == 0:
+        longest_gap_s = None
+    else:
+        longest_gap_s = int(gaps.max()) / NS_PER_S
     return Coverage(
         estimate=len(rows) / len(estimate),
-        reference_span=int(clock[reference_rows[-1]] - clock[reference_rows[0]]) / span
-        if span
-        else None,
-        longest_gap_s=None if gaps is None or len(gaps) == 0 else int(gaps.max()) / NS_PER_S,
+        reference_span=reference_span,
+        longest_gap_s=longest_gap_s,
     )
 
 
@@ -168,9 +178,12 @@ def _frames(trajectory: Trajectory) -> IntArray:
 
 def take(trajectory: Trajectory, rows: IntArray) -> Trajectory:
     """Return rows (M,) of a trajectory."""
+    times_ns = None
+    if trajectory.times_ns is not None:
+        times_ns = trajectory.times_ns[rows]
     return replace(
         trajectory,
         T_world_body=trajectory.T_world_body[rows],
-        times_ns=None if trajectory.times_ns is None else trajectory.times_ns[rows],
+        times_ns=times_ns,
         frame_indices=_frames(trajectory)[rows],
     )

@@ -101,7 +101,8 @@ def relative_error_distance(
     # the first of poses at one position
     before = np.searchsorted(travelled, travelled[beyond - 1], side="left")
     gap_before = target - travelled[before]
-    gap_beyond = np.where(beyond < n, travelled[np.minimum(beyond, n - 1)] - target, np.inf)
+    at_beyond = travelled[np.minimum(beyond, n - 1)]
+    gap_beyond = np.where(beyond < n, at_beyond - target, np.inf)
     last = np.where(gap_before <= gap_beyond, before, beyond)
     close = np.minimum(gap_before, gap_beyond) <= RPE_DISTANCE_TOLERANCE * delta_m
     return _relative_error(T_est, T_ref, first[close], last[close], delta_m, "m")

@@ -72,7 +72,9 @@ def _rows_of_frames(poses: int, numbers: IntArray) -> IntArray | None:
         return usual
     possible = [rows for rows in (*own, usual) if rows[0] < poses]
     ends = [rows[rows < poses] for rows in possible]
-    return possible[0] if all(np.array_equal(end, ends[0]) for end in ends) else None
+    if not all(np.array_equal(end, ends[0]) for end in ends):
+        return None
+    return possible[0]
 
 
 def _unclear(reference: Trajectory, numbers: IntArray, what: str) -> str:

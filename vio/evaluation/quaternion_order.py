@@ -99,6 +99,7 @@ def _spread_deg(estimate: Trajectory, reference: Trajectory, limit_s: float) -> 
         return None
     if alignment.rotation_from != "positions":
         return None
-    R = np.swapaxes(T_ref[:, :3, :3], 1, 2) @ alignment.R @ T_est[:, :3, :3]
+    R_ref_world = np.swapaxes(T_ref[:, :3, :3], 1, 2)
+    R = R_ref_world @ alignment.R @ T_est[:, :3, :3]
     mean: FloatArray = nearest_rotation(R.sum(axis=0))
     return float(np.median(rotation_angle_deg(mean.T @ R)))

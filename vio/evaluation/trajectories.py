@@ -296,7 +296,9 @@ def lengths_text(lengths_m: Sequence[float]) -> str:
     """Return path lengths in words: `10 to 50 m`."""
     first = min(lengths_m)
     last = max(lengths_m)
-    return f"{first:g} m" if first == last else f"{first:g} to {last:g} m"
+    if first == last:
+        return f"{first:g} m"
+    return f"{first:g} to {last:g} m"
 
 
 def rotation_drift_text(deg_per_100m: float, lengths_m: Sequence[float], digits: int = 3) -> str:
@@ -310,7 +312,9 @@ def rotation_drift_text(deg_per_100m: float, lengths_m: Sequence[float], digits:
 
 def _plain(value: Any) -> Any:
     """Return a record as a dictionary, and anything else as it is."""
-    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    return value
 
 
 def _require_finite(name: str, trajectory: Trajectory) -> None:
@@ -337,7 +341,9 @@ def _in_frame_of(
     T = np.asarray(T_cam0_imu, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise EvaluationError(f"T_cam0_imu must be a finite 4x4 transform, got shape {T.shape}")
-    return estimate.in_cam0(T) if reference.body == "cam0" else estimate.in_imu(T)
+    if reference.body == "cam0":
+        return estimate.in_cam0(T)
+    return estimate.in_imu(T)
 
 
 def _notes(

@@ -11,7 +11,13 @@ import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray
 
-R_GLTF_UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # glTF's axes: right, up, back
+R_GLTF_UPRIGHT = np.array(
+    [
+        [1.0, 0, 0],
+        [0, 0, 1],
+        [0, -1, 0],
+    ]
+)  # glTF's axes: right, up, back
 _PLY_NAMES = {"<f4": "float", "u1": "uchar"}
 _GLTF_KINDS = {"float32": 5126, "uint32": 5125, "uint8": 5121}  # componentType of the specification
 _ARRAY = 34962  # bufferView.target
@@ -36,7 +42,10 @@ def ply_points(
     rows = np.zeros(
         len(points), dtype=[*fields, *((name, "u1") for name in ("red", "green", "blue"))]
     )
-    columns = points if normals is None else np.concatenate([points, normals], axis=1)
+    if normals is None:
+        columns = points
+    else:
+        columns = np.concatenate([points, normals], axis=1)
     for (name, _), column in zip(fields, columns.T, strict=True):
         rows[name] = column
     if colours is not None:
@@ -77,10 +86,14 @@ def glb_mesh(
     to_gltf = R_GLTF_UPRIGHT @ R_upright_world
     opaque = np.full((len(colours), 1), 255, dtype=np.uint8)
     shown = points @ to_gltf.T.astype(np.float32)
+    low = shown.min(axis=0).tolist()
+    high = shown.max(axis=0).tolist()
+    turned = normals @ to_gltf.T.astype(np.float32)
+    rgba = np.concatenate([colours, opaque], axis=1)
     arrays: list[tuple[npt.NDArray[Any], str, dict[str, Any]]] = [
-        (shown, "VEC3", {"min": shown.min(axis=0).tolist(), "max": shown.max(axis=0).tolist()}),
-        (normals @ to_gltf.T.astype(np.float32), "VEC3", {}),
-        (np.concatenate([colours, opaque], axis=1), "VEC4", {"normalized": True}),
+        (shown, "VEC3", {"min": low, "max": high}),
+        (turned, "VEC3", {}),
+        (rgba, "VEC4", {"normalized": True}),
         (triangles.ravel(), "SCALAR", {}),
     ]
     views = []

@@ -140,7 +140,9 @@ def _components(names: Sequence[str], form: re.Pattern[str], wanted: str) -> lis
             columns.setdefault(match[1] or match[2], k)
         elif name == "w" and "w" in wanted:
             columns.setdefault("w", k)
-    return [columns[c] for c in wanted] if set(columns) >= set(wanted) else None
+    if set(columns) >= set(wanted):
+        return [columns[c] for c in wanted]
+    return None
 
 
 def _order_in(text: str) -> str | None:
@@ -151,6 +153,11 @@ def _order_in(text: str) -> str | None:
     for word in _WORDS.findall(text):
         name = re.sub(r"[^a-z]", "", word.lower())
         match = _QUATERNION.fullmatch(name)
-        component = "w" if name == "w" else (match[1] or match[2]) if match is not None else ""
+        if name == "w":
+            component = "w"
+        elif match is not None:
+            component = match[1] or match[2]
+        else:
+            component = ""
         order += component
     return order if order in ("wxyz", "xyzw") else None

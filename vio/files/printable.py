@@ -42,4 +42,6 @@ def _plain(value: Any) -> Any:
             key if key is None or isinstance(key, (int, float)) else printable(key): _plain(item)
             for key, item in value.items()
         }
-    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value

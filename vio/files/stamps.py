@@ -137,9 +137,12 @@ def _check_leading_zeros(
     They go back as decimals, and increase as seconds and nanoseconds.
     """
     back = np.flatnonzero(np.diff(times_ns) <= 0)
-    parts = [_SECONDS_AND_NANOSECONDS.fullmatch(text) for text in texts] if len(back) else []
+    parts = []
+    if len(back):
+        parts = [_SECONDS_AND_NANOSECONDS.fullmatch(text) for text in texts]
     found = [(int(part[1]), int(part[2])) for part in parts if part is not None]
-    if len(found) < len(texts) or not found or any(a >= b for a, b in pairwise(found)):
+    is_complete = len(found) == len(texts)
+    if not is_complete or not found or any(a >= b for a, b in pairwise(found)):
         return
     k = int(back[0])
     raise DataError(
@@ -172,7 +175,8 @@ def _unit_of(
     mean = float(values[-1] - values[0]) / (len(values) - 1)
     if pace.believes(mean * _seconds(by_size)):
         return by_size
-    step = float(np.median([float(b - a) for a, b in pairwise(values)]))
+    steps = [float(b - a) for a, b in pairwise(values)]
+    step = float(np.median(steps))
     if pace.believes(step * _seconds(by_size)):
         return by_size
     by_pace = _unit_by_pace(step, values[-1], pace)

@@ -190,7 +190,13 @@ class KeptRows:
     def __init__(self, path: Path, dtype: np.dtype) -> None:
         """Begin without rows; `path` is the file's, `dtype` that of the table's rows."""
         self._path = path
-        self._dtype = np.dtype([("checkpoint", "<u4"), ("index", "<i8"), ("row", dtype)])
+        self._dtype = np.dtype(
+            [
+                ("checkpoint", "<u4"),
+                ("index", "<i8"),
+                ("row", dtype),
+            ]
+        )
         self._rows: dict[int, Rows] = {}
 
     def keep(self, table: Table, indices: Sequence[int], checkpoint: int) -> None:

@@ -145,7 +145,9 @@ def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> In
     back = np.flatnonzero(times[1:] <= times[:-1])
     if len(back):
         k = int(back[0]) + 1
-        what = "repeats" if times[k] == times[k - 1] else "runs backwards"
+        what = "runs backwards"
+        if times[k] == times[k - 1]:
+            what = "repeats"
         now = seconds_text(int(times[k]))
         before = seconds_text(int(times[k - 1]))
         repeated = int(np.count_nonzero(times[1:] == times[:-1]))
@@ -185,4 +187,6 @@ def whole_ns_stamps(
             remedy = "write seconds times 1e9, without a point or exponent"
             raise DataError(f"{where(k)}: {text!r} is no time in whole nanoseconds; {remedy}")
         times.append(int(found[1]))
-    return check_increasing(times, where) if increasing else np.array(times, dtype=np.int64)
+    if increasing:
+        return check_increasing(times, where)
+    return np.array(times, dtype=np.int64)

@@ -203,7 +203,10 @@ def _times_ns(table: _Table, columns: PoseColumns, kind: TrajectoryFormat) -> In
         return whole_ns_stamps(stamps, table.where, signed=True)
     doubts = list[str]()
     # TUM's form has decimals of seconds
-    pace = None if kind == "tum" and any("." in stamp for stamp in stamps) else POSE_PACE
+    if kind == "tum" and any("." in stamp for stamp in stamps):
+        pace = None
+    else:
+        pace = POSE_PACE
     times_ns = parse_stamps(stamps, table.where, unit, pace=pace, doubts=doubts)
     for doubt in doubts:
         logger.warning("%s", doubt)
@@ -338,7 +341,9 @@ def is_trajectory_file(path: Path) -> bool:
         [float(field) for field in fields]
     except ValueError:
         return False
-    return len(fields) >= 8 if "," in first else len(fields) in (8, 12)
+    if "," in first:
+        return len(fields) >= 8
+    return len(fields) in (8, 12)
 
 
 def in_first_cam0(trajectory: Trajectory, T_cam0_imu: FloatArray) -> Trajectory:
@@ -417,7 +422,10 @@ def _check_columns(table: _Table, kind: TrajectoryFormat, *, as_requested: bool)
         expected = count
     for row, line in enumerate(table.rows):
         separator = table.separator
-        count = len(line.split()) if separator is None else line.count(separator) + 1
+        if separator is None:
+            count = len(line.split())
+        else:
+            count = line.count(separator) + 1
         if count != expected:
             table.fail(
                 row, f"{count} columns instead of {expected}; {kind} form has {_COLUMNS[kind]}"

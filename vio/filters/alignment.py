@@ -112,12 +112,16 @@ def _rotation_information(
     dot = np.sum(u * v, axis=1)[:, None]
     ut = (u @ t)[:, None]
     vt = (v @ t)[:, None]
-    r_D_bias = (ut * v - dot * t) @ phi_D_bias[0] + (dot * t - vt * u) @ phi_D_bias[1]
+    r_D_phi_u = ut * v - dot * t
+    r_D_phi_v = dot * t - vt * u
+    r_D_bias = r_D_phi_u @ phi_D_bias[0] + r_D_phi_v @ phi_D_bias[1]
     J = np.concatenate([r_D_bias, n @ across], axis=1)
     A = (J * w[:, None]).T @ J
     b = -(J * w[:, None]).T @ (n @ t)
     lost = A[:3, 3:] @ np.linalg.inv(A[3:, 3:] + _ALIGNMENT.tiny * np.eye(2))
-    return A[:3, :3] - lost @ A[3:, :3], b[:3] - lost @ b[3:]
+    information = A[:3, :3] - lost @ A[3:, :3]
+    pull = b[:3] - lost @ b[3:]
+    return information, pull
 
 
 def align_visual_inertial(
@@ -170,7 +174,8 @@ def align_visual_inertial(
         depth = np.maximum(
             np.linalg.norm(centres + d[:, None, None] * m[:, None], axis=2), _ALIGNMENT.min_depth_m
         )
-        off = np.linalg.norm(A_x @ x + A_d * d[:, None, None] - b, axis=2) / depth
+        residual = A_x @ x + A_d * d[:, None, None] - b
+        off = np.linalg.norm(residual, axis=2) / depth
         weight = (
             seen * (d > 0)[:, None] / depth**2 / (1 + (off / _ALIGNMENT.bearing_sigma_rad) ** 2)
         )
@@ -187,7 +192,9 @@ def _with_length(S: FloatArray, r: FloatArray, length: float) -> FloatArray | No
     smallest eigenvalue.
     Reference: Golub & Van Loan, Matrix computations, section 6.2.1 (least squares over a sphere).
     """
-    if np.linalg.eigvalsh(S[:3, :3])[0] <= 1e-9 * np.trace(S[:3, :3]) or not np.isfinite(S).all():
+    of_rotation = S[:3, :3]
+    smallest = np.linalg.eigvalsh(of_rotation)[0]
+    if smallest <= 1e-9 * np.trace(of_rotation) or not np.isfinite(S).all():
         return None
     v_D_g = -np.linalg.solve(S[:3, :3], S[:3, 3:])
     v_0 = np.linalg.solve(S[:3, :3], r[:3])

@@ -72,7 +72,10 @@ class ErrorState:
 
     def clone(self, index: int) -> slice:
         """Rows of a clone, -1 being the newest."""
-        bounds = self.clones.start if index >= 0 else self.clones.stop
+        if index >= 0:
+            bounds = self.clones.start
+        else:
+            bounds = self.clones.stop
         return slice(bounds + 6 * index, bounds + 6 * index + 6)
 
     def jacobian(

@@ -107,7 +107,9 @@ class FrameUpdate:
         self._rig.end_frame(window, seen)
         propagation = self._propagation
         pixels = self._take_pixels(window, seen)
-        motion = window.camera_move_since(-2) if len(window.clones) > 1 else None
+        motion = None
+        if len(window.clones) > 1:
+            motion = window.camera_move_since(-2)
         T_world_imu = window.nav.T_world_imu
         tracks = self._linearise_prediction(window, pixels)
         innovation = tracks.newest_innovation()
@@ -153,13 +155,16 @@ class FrameUpdate:
         gated_ids = np.concatenate([gated_ids, rejected])
         created, spent = self._marginalise(window, tracks, good, pixels, bool(seen.has_right.any()))
         self.fit.tracks.update_pixel_noise(nis, dof, spent)
+        nis_per_dof = None
+        if len(nis):
+            nis_per_dof = median(nis / dof)
         return UpdateReport(
             used=int(good.sum()) + int((pixels.weight[:, 0] > 0).sum()),
             gated=len(gated_ids),
             initialised=created,
             landmarks=len(window.landmarks),
             innovation_median_px=innovation,
-            nis_per_dof=median(nis / dof) if len(nis) else None,
+            nis_per_dof=nis_per_dof,
             gated_ids=gated_ids,
             landmark_ids=window.landmark_ids.copy(),
             innovation_ratio=innovation_ratio,

@@ -95,7 +95,10 @@ class ImuHistory:
         """Measure the median distance of the last few samples."""
         kept = self._samples[len(self._samples) - last :]
         times = np.array([x.time_ns for x in kept], dtype=np.int64)
-        self._period = median(np.diff(times)) if len(times) > 1 else 0.0
+        if len(times) > 1:
+            self._period = median(np.diff(times))
+        else:
+            self._period = 0.0
         self._unmeasured = 0
 
     def hidden(self, cuts_ns: FloatArray, times_ns: FloatArray) -> Hidden | None:
@@ -114,7 +117,8 @@ class ImuHistory:
         left = np.concatenate([[-np.inf], times_ns])[after]  # the samples around each step
         right = np.concatenate([times_ns, [np.inf]])[after]
         held = np.isinf(right - left)
-        silent = np.where(held, np.minimum(cuts_ns[1:] - left, right - cuts_ns[:-1]), right - left)
+        until_cut = np.minimum(cuts_ns[1:] - left, right - cuts_ns[:-1])
+        silent = np.where(held, until_cut, right - left)
         gap = silent > longest_ns
         uncertain = gap | held | (silent > _GAPS.slow_ns)
         cut_ns = (

@@ -67,7 +67,9 @@ def imu_start(samples: Sequence[ImuSample], time_ns: int, imu: ImuSettings) -> I
     if length < 1e-3:
         raise EstimationError("the accelerometer reads zero; is it in m/s^2, with gravity in it?")
     s = imu
-    span_s = max(-float(times_s[0]), 1e-3) if len(times_s) > 1 else 5e-3
+    span_s = 5e-3
+    if len(times_s) > 1:
+        span_s = max(-float(times_s[0]), 1e-3)
     force_noise, rate_noise = (
         d / np.sqrt(span_s) for d in (s.accel_noise_density, s.gyro_noise_density)
     )

@@ -126,7 +126,8 @@ def is_still(
     a, b = shared_rows(before[-1].ids, now.ids)
     if len(a) < _START.min_tracks:
         return False
-    moved = np.linalg.norm(before[-1].z[a, :2] - now.z[b, :2], axis=1)
+    flow_px = before[-1].z[a, :2] - now.z[b, :2]
+    moved = np.linalg.norm(flow_px, axis=1)
     return bool(np.median(moved) < _START.still_px) and imu_start(samples, now.time_ns, imu).still
 
 
@@ -209,7 +210,8 @@ class MonoStarter:
         """Note that features and IMU contradict each other; whether they did so long ago, too,
         as by a wrong clock.
         """
-        self._contradicted_ns = now_ns if self._contradicted_ns is None else self._contradicted_ns
+        if self._contradicted_ns is None:
+            self._contradicted_ns = now_ns
         return now_ns - self._contradicted_ns > _GRAVITY.patience_s * 1e9
 
     def _views(self) -> list[Observations]:

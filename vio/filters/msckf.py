@@ -352,7 +352,10 @@ class Msckf(Backend):
         covariance[:of_nav, :of_nav] = P
         covariance[of_nav:, of_nav:] = own
         window = Window(self._propagation.motion, nav, covariance, calibration)
-        before = None if self._window is None else self._window.prior.scale_test
+        if self._window is None:
+            before = None
+        else:
+            before = self._window.prior.scale_test
         self._rig.test_scale(window, self._source, before)
         return window
 
@@ -420,7 +423,9 @@ class Msckf(Backend):
 
         None where one of them is not in the window.
         """
-        return None if self._frame.smoothed is None else self._frame.smoothed.motion(older, newer)
+        if self._frame.smoothed is None:
+            return None
+        return self._frame.smoothed.motion(older, newer)
 
     def landmarks(self) -> Landmarks:
         """Return the points of all tracks that were used and fix their depth, with their covariance

@@ -158,7 +158,10 @@ class MotionNoise:
 
     def update(self, step: StepErrors) -> None:
         """Learn from one step."""
-        self._sum = step if self._sum is None else self._sum + step
+        if self._sum is None:
+            self._sum = step
+        else:
+            self._sum = self._sum + step
         self._steps += 1
         if self._steps < _NOISE.summed_steps:
             return
@@ -185,4 +188,5 @@ class MotionNoise:
         gain = self._variance[k] * H / (H * self._variance[k] * H + 1 / 3)
         innovation = 2 * chi_square_cdf(test.squared, test.dof) - 1
         self._variance[k] *= 1 - gain * H
-        self.factors[k] = np.clip(self.factors[k] * np.exp(0.5 * gain * innovation), *self._bounds)
+        changed = self.factors[k] * np.exp(0.5 * gain * innovation)
+        self.factors[k] = np.clip(changed, *self._bounds)

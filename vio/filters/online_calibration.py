@@ -479,7 +479,9 @@ class _TimeOffsetBlock(CalibrationBlock):
         T_exposed: FloatArray,
         twist: Twist | None,
     ) -> FloatArray | None:
-        return None if twist is None else (se3_adjoint(T_exposed) @ twist.significant())[:, None]
+        if twist is None:
+            return None
+        return (se3_adjoint(T_exposed) @ twist.significant())[:, None]
 
 
 class _FirstAttitudeBlock(CalibrationBlock):

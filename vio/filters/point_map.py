@@ -54,7 +54,11 @@ class PointMap:
 
     def turn(self, R: FloatArray) -> None:
         """Turn the world by R (3, 3)."""
-        self.parts = [Landmarks(m.ids, m.p_world @ R.T, R @ m.covariance @ R.T) for m in self.parts]
+        turned = []
+        for part in self.parts:
+            covariance = R @ part.covariance @ R.T
+            turned.append(Landmarks(part.ids, part.p_world @ R.T, covariance))
+        self.parts = turned
 
     def drop_broken(self) -> None:
         """Forget parts that are not made of numbers."""

@@ -136,7 +136,9 @@ class Propagation:
 
     def unknown_noise(self) -> MotionNoise:
         """The motion model's noise where nothing was learned of it."""
-        return MotionNoise(*IMU_FACTORS) if self.source == "imu" else MotionNoise(*_TWIST_FACTORS)
+        if self.source == "imu":
+            return MotionNoise(*IMU_FACTORS)
+        return MotionNoise(*_TWIST_FACTORS)
 
     def begin(self, window: Window, time_ns: int, body_ns: int) -> None:
         """Go on from a window without clones, at the times of a frame and of the navigation
@@ -295,10 +297,12 @@ class Propagation:
             T, J = window.camera_at(late_s, twist, nav)
             if not window.calibration.moves_camera and "imu_terms" not in window.state:
                 M = growth.Phi[:6] - _POSE
-                moved = M @ self.posterior.own[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
+                P = self.posterior.own[:DIM, :DIM]
+                moved = M @ P @ M.T + growth.Q[:6, :6]
             else:
                 M = np.concatenate([J @ self.grown(window, nav, growth), -_I6], axis=1)
-                moved = M @ self.posterior.with_newest @ M.T + J[:, :DIM] @ growth.Q @ J[:, :DIM].T
+                J_step = J[:, :DIM]
+                moved = M @ self.posterior.with_newest @ M.T + J_step @ growth.Q @ J_step.T
             last = self._camera = nav, growth, late_s, (T, J, moved)
         T, J, moved = last[3]
         noise = window.exposure_noise(T, late_s, twist)
@@ -320,7 +324,10 @@ class Propagation:
         R = nav.T_world_imu[:3, :3]
         own = window.state.motion
         rate_D_error = self.motion.rate_D_error(nav)
-        Phi = growth.Phi if own.stop == DIM else self.grown(window, nav, growth)[own, own]
+        if own.stop == DIM:
+            Phi = growth.Phi
+        else:
+            Phi = self.grown(window, nav, growth)[own, own]
         P = Phi @ self.posterior.own[own, own] @ Phi.T
         P[:DIM, :DIM] += growth.Q
         covariance = np.zeros((6, 6))
@@ -364,7 +371,8 @@ class Propagation:
         if not self.blind:
             with_newest = self.reported.with_newest
             J = np.eye(6, len(with_newest), len(own))  # of the camera, and back to the body
-            J[:, : len(own)] += window.since_first(window.body_D_error()[-6:])[:, : len(own)]
+            newest_D_error = window.body_D_error()[-6:]
+            J[:, : len(own)] += window.since_first(newest_D_error)[:, : len(own)]
             return window.clones.T_world_imu[-1], J @ with_newest @ J.T
         T, J, noise = window.camera_D_own(
             self.late_s, self.twist(window, window.nav, self.since_frame)

@@ -75,7 +75,8 @@ def restarted(
     J = np.eye(6)
     J[:3, 3:] = so3_hat(moved.T_world_imu[:3, 3])
     P = np.zeros((DIM, DIM))
-    P[:6, :6] = good.covariance[:6, :6] + J @ np.diag(np.repeat([position, rotation], 3) ** 2) @ J.T
+    sigma = np.repeat([position, rotation], 3)
+    P[:6, :6] = good.covariance[:6, :6] + J @ np.diag(sigma**2) @ J.T
     P[6:, 6:] = motion.start_covariance()[6:, 6:]
     return moved, P
 
@@ -106,7 +107,10 @@ def held_covariance(good: Estimate, new: Estimate, up: FloatArray) -> FloatArray
         up: (3,) the axis of the yaw, world.
     """
     elapsed_s = (new.time_ns - good.time_ns) / NS_PER_S
-    velocity = np.zeros(3) if good.velocity_world is None else good.velocity_world
+    if good.velocity_world is None:
+        velocity = np.zeros(3)
+    else:
+        velocity = good.velocity_world
     position, rotation = _unseen_motion(velocity, elapsed_s)
     R_good = good.T_world_imu[:3, :3]
     up_good = R_good.T @ up
@@ -116,7 +120,8 @@ def held_covariance(good: Estimate, new: Estimate, up: FloatArray) -> FloatArray
     about_up = np.outer(R.T @ up, R.T @ up)
     P = np.zeros((6, 6))
     P[:3, :3] = rotated(R.T, of_position)
-    P[3:, 3:] = of_yaw * about_up + (new.tilt_sigma_rad or 0.0) ** 2 * (np.eye(3) - about_up)
+    tilt_sigma = new.tilt_sigma_rad or 0.0
+    P[3:, 3:] = of_yaw * about_up + tilt_sigma**2 * (np.eye(3) - about_up)
     return P
 
 

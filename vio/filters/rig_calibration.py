@@ -93,7 +93,10 @@ def scale_sigma(settings: MsckfSettings) -> float:
 @functools.lru_cache(maxsize=8)
 def _powers_over_width(camera: StereoCamera) -> FloatArray:
     """Means over the width (4,) of what multiplies the columns' coefficients in the middle row."""
-    width = 2.0 * camera.cu if camera.width is None else camera.width
+    if camera.width is None:
+        width = 2.0 * camera.cu
+    else:
+        width = camera.width
     x = (np.linspace(0.0, width, _RIG.field_samples) - camera.cu) / camera.fu
     return np.array([1.0, x.mean(), (x**2).mean(), (x**4).mean()])
 

@@ -86,8 +86,11 @@ def step_by_images(camera: StereoCamera, p_prev: FloatArray, z: FloatArray) -> F
         weight = 1.0 / (1.0 + np.sum(r**2, axis=1) / width**2)
         A = np.einsum("f,fki,fkj->ij", weight, J, J)
         b = np.einsum("f,fki,fk->i", weight, J, r)
-        T = se3_exp(np.linalg.solve(A + 1e-9 * np.trace(A) * np.eye(6), b)) @ T
-    return T if explained_share(camera, T, p_prev, z) >= _STEP.min_share else None
+        damped = A + 1e-9 * np.trace(A) * np.eye(6)
+        T = se3_exp(np.linalg.solve(damped, b)) @ T
+    if explained_share(camera, T, p_prev, z) >= _STEP.min_share:
+        return T
+    return None
 
 
 def explained_share(

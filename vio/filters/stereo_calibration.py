@@ -127,7 +127,9 @@ class VerticalDisparityModel:
         # Rows of one feature share their error from frame to frame, so only the features of one
         # frame count as many.
         shared = max(self._count / max(self._matches, 1), 1.0)
-        noise = self._squares / max(self._count, 1.0) if self._count else 1.0
+        noise = 1.0
+        if self._count:
+            noise = self._squares / max(self._count, 1.0)
         return np.asarray(noise * shared / self._camera.fv**2 * self._inverse, dtype=np.float64)
 
     @property
@@ -136,14 +138,18 @@ class VerticalDisparityModel:
         them alike.
         """
         full = len(self._shifts) == _SHIFT_FRAMES
-        return abs(sum(self._shifts)) / _SHIFT_FRAMES if full else 0.0
+        if not full:
+            return 0.0
+        return abs(sum(self._shifts)) / _SHIFT_FRAMES
 
     @property
     def stated_px(self) -> float:
         """Root mean square of the field over the matches of all frames: wherever in the image the
         features of the last one lie, that is what is stated.
         """
-        return math.sqrt(self._field_squares / self._field_count) if self._field_count else 0.0
+        if not self._field_count:
+            return 0.0
+        return math.sqrt(self._field_squares / self._field_count)
 
     @property
     def offset_px(self) -> float | None:
@@ -263,7 +269,10 @@ def eliminate_points(
     """
     rows = chosen.nonzero()[0]
     size = info.G.shape[1]
-    D = size if columns is None else size + len(columns.wanted.chosen)
+    if columns is None:
+        D = size
+    else:
+        D = size + len(columns.wanted.chosen)
     out = Eliminated(np.empty((3 * len(rows), D)), np.zeros((D, D)), np.zeros(D))
     loops.eliminate_tracks(rows, info, out)
     A = out.A

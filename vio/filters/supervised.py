@@ -71,16 +71,26 @@ class _Handover:
         gravity = own.gravity_world
         if gravity is None and not self.is_upright:
             gravity = _DOWN * gravity_mps2
+        velocity_world = None
+        if own.velocity_world is not None:
+            velocity_world = R @ own.velocity_world
+        velocity_covariance = None
+        if own.velocity_covariance is not None:
+            velocity_covariance = R @ own.velocity_covariance @ R.T
+        gravity_world = None
+        if gravity is not None:
+            gravity_world = R @ gravity
+        tilt_sigma_rad = None
+        if self.is_upright:
+            tilt_sigma_rad = own.tilt_sigma_rad
         return replace(
             own,
             T_world_imu=self.T_reported_own @ own.T_world_imu,
             covariance=own.covariance + A @ self.pose.covariance @ A.T,
-            velocity_world=None if own.velocity_world is None else R @ own.velocity_world,
-            velocity_covariance=None
-            if own.velocity_covariance is None
-            else R @ own.velocity_covariance @ R.T,
-            gravity_world=None if gravity is None else R @ gravity,
-            tilt_sigma_rad=own.tilt_sigma_rad if self.is_upright else None,
+            velocity_world=velocity_world,
+            velocity_covariance=velocity_covariance,
+            gravity_world=gravity_world,
+            tilt_sigma_rad=tilt_sigma_rad,
         )
 
     def points(self, own: Landmarks) -> Landmarks:
@@ -229,7 +239,10 @@ class SupervisedMsckf(Backend):
 
     def _placed(self, good: Estimate, own: Estimate, frame: int) -> _Handover:
         """Place a new filter's world, upright as it is, where the last good pose is."""
-        before = np.eye(3) if self._handover is None else self._handover.T_reported_own[:3, :3]
+        if self._handover is None:
+            before = np.eye(3)
+        else:
+            before = self._handover.T_reported_own[:3, :3]
         upright = self._handover is None or self._handover.is_upright
         R_good = before.T @ good.T_world_imu[:3, :3]
         yaw = so3_exp([0.0, 0.0, nearest_yaw(R_good @ own.T_world_imu[:3, :3].T)])

@@ -32,7 +32,9 @@ class Views(NamedTuple):
 
     def take(self, index: BoolArray) -> Views:
         """Return the tracks of a mask (F,)."""
-        return self if index.all() else Views(self.z[index], self.weight[index])
+        if index.all():
+            return self
+        return Views(self.z[index], self.weight[index])
 
 
 class Residuals(NamedTuple):

@@ -92,7 +92,8 @@ class TrackTable:
             return
         gone = np.zeros(len(self._ids), dtype=np.bool_)
         gone[rows] = True
-        self._rows, self._free = self._rows[~gone[self._rows]], np.concatenate([self._free, rows])
+        self._rows = self._rows[~gone[self._rows]]
+        self._free = np.concatenate([self._free, rows])
         self.forget_views(rows)
 
     def _grow(self, size: int) -> None:

@@ -79,7 +79,8 @@ def update_landmarks(
     K = np.swapaxes(np.linalg.solve(S, H @ P), -1, -2)
     IKH = np.eye(3) - K @ H
     # Joseph's form: symmetric and positive whatever the rounding of K.
-    P_new = IKH @ P @ np.swapaxes(IKH, -1, -2) + pixel_variance * K @ np.swapaxes(K, -1, -2)
+    by_pixels = pixel_variance * K @ np.swapaxes(K, -1, -2)
+    P_new = IKH @ P @ np.swapaxes(IKH, -1, -2) + by_pixels
     return m + (K @ residual[..., None])[..., 0], P_new
 
 
@@ -194,7 +195,10 @@ class Vislam(Backend):
         self._frame_time_ns: int | None = None  # of the last frame
         self._map = _Map()
         probability = settings.gate_probability
-        self._gate = np.inf if probability is None else float(chi_square_quantile(probability, 4))
+        if probability is None:
+            self._gate = np.inf
+        else:
+            self._gate = float(chi_square_quantile(probability, 4))
 
     @classmethod
     def build(
@@ -275,6 +279,9 @@ class Vislam(Backend):
         initialised = self._initialise(fresh.ids, fresh.z)
         if not np.isfinite(self._state.U).all() or not np.isfinite(self._state.Sigma).all():
             raise EstimationError(self._lost(observations.frame_index))
+        innovation_ratio = None
+        if nis_per_dof is not None:
+            innovation_ratio = math.sqrt(nis_per_dof)
         return UpdateReport(
             used=used,
             gated=gated,
@@ -282,7 +289,7 @@ class Vislam(Backend):
             landmarks=len(self._map),
             innovation_median_px=innovation,
             nis_per_dof=nis_per_dof,
-            innovation_ratio=None if nis_per_dof is None else math.sqrt(nis_per_dof),
+            innovation_ratio=innovation_ratio,
         )
 
     def _lost(self, frame_index: int) -> str:
@@ -298,7 +305,10 @@ class Vislam(Backend):
         U = self._state.U
         twist = self._state.twist
         T_world_imu = se3_inverse(U)
-        velocity = None if twist is None else T_world_imu[:3, :3] @ twist[:3]
+        if twist is None:
+            velocity = None
+        else:
+            velocity = T_world_imu[:3, :3] @ twist[:3]
         return Estimate(self._time_ns or 0, T_world_imu, self._state.Sigma[:6, :6].copy(), velocity)
 
     def landmarks(self) -> Landmarks:
@@ -356,7 +366,8 @@ class Vislam(Backend):
         U = self._state.U
         H = z_D_xi(self._camera, self._T_cam0_imu, U, m)
         residual = z - project(self._camera, transform_points(self._T_cam0_imu @ U, m))
-        S = H @ self._state.Sigma[:6, :6] @ np.swapaxes(H, -1, -2) + self._residual_covariance(m, P)
+        by_pose = H @ self._state.Sigma[:6, :6] @ np.swapaxes(H, -1, -2)
+        S = by_pose + self._residual_covariance(m, P)
         return residual, np.einsum(
             "ni,ni->n", residual, np.linalg.solve(S, residual[..., None])[..., 0]
         )

@@ -30,7 +30,10 @@ class PoseState:
 
     def corrected(self, correction: FloatArray, Sigma: FloatArray) -> PoseState:
         """Return the state moved by a correction (6,) or (12,), with a new covariance."""
-        twist = None if self.twist is None else self.twist + correction[6:]
+        if self.twist is None:
+            twist = None
+        else:
+            twist = self.twist + correction[6:]
         return PoseState(se3_exp(correction[:6]) @ self.U, twist, Sigma)
 
 
@@ -68,7 +71,12 @@ def predict_twist(
     F[:6, :6] = se3_adjoint(step)
     F[:6, 6:] = -tau_s * se3_left_jacobian(-tau_s * u)
     Q = np.diag(density)
-    W = np.block([[Q * tau_s**3 / 3, -Q * tau_s**2 / 2], [-Q * tau_s**2 / 2, Q * tau_s]])
+    W = np.block(
+        [
+            [Q * tau_s**3 / 3, -Q * tau_s**2 / 2],
+            [-Q * tau_s**2 / 2, Q * tau_s],
+        ]
+    )
     return step @ U, F @ Sigma @ F.T + W
 
 
@@ -180,7 +188,12 @@ class DriftingTwist:
     def with_inflated_covariance(self, state: PoseState, tau_s: float) -> PoseState:
         """Return the state with the last step's twist at least as uncertain as at the start."""
         start = np.diag(np.maximum(self._start - np.diag(state.Sigma)[6:], 0.0))
-        inflation = np.block([[start * tau_s**2, -start * tau_s], [-start * tau_s, start]])
+        inflation = np.block(
+            [
+                [start * tau_s**2, -start * tau_s],
+                [-start * tau_s, start],
+            ]
+        )
         return replace(state, Sigma=state.Sigma + inflation)
 
     def predict(self, state: PoseState, start_ns: int, end_ns: int) -> PoseState:

@@ -351,7 +351,8 @@ class Window:
         P = self.prior.to_change()
         delta = self.prior.delta
         P[first:] += p_cross @ (P[turn] - P[before])
-        P[first:, first:] += (P[first:, turn] - P[first:, before]) @ p_cross.T
+        difference = P[first:, turn] - P[first:, before]
+        P[first:, first:] += difference @ p_cross.T
         P[:first, first:] = P[first:, :first].T
         delta[first:] += p_cross @ (delta[turn] - delta[before])
         V = self.prior.error_D_constants

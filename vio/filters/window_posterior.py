@@ -121,8 +121,13 @@ class WindowPosterior:
         a = slice(6 * i, 6 * i + 6)
         b = slice(6 * j, 6 * j + 6)
         A = se3_adjoint(se3_inverse(T_j))
-        C = A @ (self.P[a, a] + self.P[b, b] - self.P[a, b] - self.P[b, a]) @ A.T
+        C = A @ self._difference(a, b) @ A.T
         return RelativePose(se3_inverse(T_i) @ T_j, C)
+
+    def _difference(self, a: slice, b: slice) -> FloatArray:
+        """Covariance of the difference of two parts of the error vector."""
+        P = self.P
+        return P[a, a] + P[b, b] - P[a, b] - P[b, a]
 
     def is_stationary(self, velocity_sigma_mps: float, rate_sigma_radps: float) -> bool:
         """Test whether the motion from the oldest to the newest clone is indistinguishable from
@@ -142,7 +147,7 @@ class WindowPosterior:
         b = slice(len(self.P) - 6, None)
         T_old_world = se3_inverse(old.T_world_imu)
         A = se3_adjoint(T_old_world)
-        C = A @ (self.P[a, a] + self.P[b, b] - self.P[a, b] - self.P[b, a]) @ A.T
+        C = A @ self._difference(a, b) @ A.T
         limit = _STATIONARY_LIMIT  # no eigenvalue of C is larger than its trace
         most = float(C.trace()) + 6e-18
         moved = new.T_world_imu[:3, 3] - old.T_world_imu[:3, 3]
@@ -168,7 +173,8 @@ def given(P: FloatArray, rows: slice) -> FloatArray:
     scale[scale == 0] = np.inf  # known already
     values, vectors = np.linalg.eigh(known / (scale[:, None] * scale))
     independent = values > _GIVEN_RANK
-    half = (vectors[:, independent] / np.sqrt(values[independent])).T @ (P[rows] / scale[:, None])
+    whitening = vectors[:, independent] / np.sqrt(values[independent])
+    half = whitening.T @ (P[rows] / scale[:, None])
     out: FloatArray = P - half.T @ half
     out[rows] = 0.0
     out[:, rows] = 0.0

@@ -132,7 +132,10 @@ class WindowTracks:
         self._camera = camera
         self._settings = settings
         self.table = TrackTable(settings.clones + 1)
-        self._least_px = _TRACKS.min_mono_px if camera.kind == "mono" else MIN_PIXEL_SIGMA_PX
+        if camera.kind == "mono":
+            self._least_px = _TRACKS.min_mono_px
+        else:
+            self._least_px = MIN_PIXEL_SIGMA_PX
         self._frames = 0  # from which the noise was learned
         # of one pixel coordinate, px^2; follows the residuals
         self.variance = settings.pixel_sigma_px**2
@@ -310,7 +313,9 @@ class WindowTracks:
         """Move each point as its own normal equations say once the clones (6N,) and the field
         (S,) have moved.
         """
-        other = 0.0 if columns is None else stereo_errors @ columns.G[:, : len(stereo_errors)]
+        other: FloatArray | float = 0.0
+        if columns is not None:
+            other = stereo_errors @ columns.G[:, : len(stereo_errors)]
         self.table.points[tracks.rows] = tracks.information.moved_points(exposure_errors, other)
 
     def agree(self, at: Residuals) -> bool:

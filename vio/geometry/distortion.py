@@ -18,7 +18,7 @@ from vio.errors import CalibrationError
 from vio.geometry.lenses.model import Lens
 from vio.geometry.lenses.registry import LENSES
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import StereoCamera, intrinsic_matrix
 
 DistortionModel: TypeAlias = str  # a key of `vio.geometry.lenses.registry.LENSES`
 
@@ -86,7 +86,7 @@ class CameraModel:
     @property
     def K(self) -> FloatArray:
         """Intrinsic matrix (3, 3), pixels."""
-        return np.array([[self.fu, 0, self.cu], [0, self.fv, self.cv], [0, 0, 1]], dtype=np.float64)
+        return intrinsic_matrix(self.fu, self.fv, self.cu, self.cv)
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,7 +70,9 @@ def _one(phi: FloatArray) -> tuple[float, float, float, float] | None:
         return None
     x, y, z = phi.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
-    return (x, y, z, angle) if math.isfinite(angle) else None
+    if not math.isfinite(angle):
+        return None
+    return (x, y, z, angle)
 
 
 def length(vector: FloatArray) -> float:
@@ -184,7 +186,8 @@ def _quat_xyzw_of_one(R: FloatArray) -> tuple[float, float, float, float]:
         y = m02 - m20
         z = m10 - m01
         w = 1 + trace
-    size = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), -1.0 if w < 0 else 1.0)
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    size = math.copysign(norm, -1.0 if w < 0 else 1.0)
     return x / size, y / size, z / size, w / size
 
 
@@ -198,7 +201,10 @@ def _rotation_vector_of_one(R: FloatArray) -> tuple[float, float, float] | None:
     if not math.isfinite(x + y + z + w):
         return None
     s = math.sqrt(x * x + y * y + z * z)
-    ratio = 2.0 if s < 1e-7 else 2 * math.atan2(s, w) / s
+    if s < 1e-7:
+        ratio = 2.0
+    else:
+        ratio = 2 * math.atan2(s, w) / s
     return ratio * x, ratio * y, ratio * z
 
 
@@ -298,7 +304,14 @@ def se3_inverse(T: npt.ArrayLike) -> FloatArray:
         p = -(a * x + d * y + g * z)
         q = -(b * x + e * y + h * z)
         r = -(c * x + f * y + i * z)
-        return np.array([[a, d, g, p], [b, e, h, q], [c, f, i, r], [0.0, 0.0, 0.0, 1.0]])
+        return np.array(
+            [
+                [a, d, g, p],
+                [b, e, h, q],
+                [c, f, i, r],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return se3_from_parts(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
@@ -323,7 +336,16 @@ def se3_adjoint(T: npt.ArrayLike) -> FloatArray:
         one = np.zeros((6, 6))
         one[:3, :3] = one[3:, 3:] = R
         x, y, z = T[:3, 3].tolist()
-        one[:3, 3:] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ R
+        one[:3, 3:] = (
+            np.array(
+                [
+                    [0.0, -z, y],
+                    [z, 0.0, -x],
+                    [-y, x, 0.0],
+                ]
+            )
+            @ R
+        )
         return one
     out = np.zeros((*T.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = R

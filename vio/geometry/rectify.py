@@ -76,7 +76,9 @@ def projection_of(rig: StereoRig) -> Projection:
     """
     R0, R1, _ = rectifying_rotations(rig)
     low, high = _common_rectangle(rig, R0, R1, "cylinder")
-    return "cylinder" if low[1] < -PINHOLE_REACH and high[1] > PINHOLE_REACH else "pinhole"
+    if low[1] < -PINHOLE_REACH and high[1] > PINHOLE_REACH:
+        return "cylinder"
+    return "pinhole"
 
 
 def rectified_cameras(rig: StereoRig, projection: ProjectionMode = "pinhole") -> RectifiedPair:
@@ -191,14 +193,17 @@ def field_of_view(camera: CameraModel | StereoCamera) -> tuple[float, float]:
     h = camera.height - 1.0
     s = np.linspace(0, 1, 2 * _VIEW.border_samples + 1)
     spans = []
-    for uv in (np.stack([w * s, 0 * s + h / 2], axis=1), np.stack([0 * s + w / 2, h * s], axis=1)):
+    middle_row = np.stack([w * s, 0 * s + h / 2], axis=1)
+    middle_column = np.stack([0 * s + w / 2, h * s], axis=1)
+    for uv in (middle_row, middle_column):
         ray, valid = (
             (left_rays(camera, uv), None)
             if isinstance(camera, StereoCamera)
             else unproject_pixel(camera, uv)
         )
         off_axis = np.arctan2(np.hypot(ray[:, 0], ray[:, 1]), ray[:, 2])
-        off_axis = off_axis if valid is None else np.where(valid, off_axis, 0.0)
+        if valid is not None:
+            off_axis = np.where(valid, off_axis, 0.0)
         spans.append(
             float(
                 off_axis[: _VIEW.border_samples + 1].max() + off_axis[_VIEW.border_samples :].max()
@@ -299,11 +304,12 @@ def _inner_rectangle(
     w = camera.width - 1.0
     h = camera.height - 1.0
     s = np.linspace(0, 1, _VIEW.border_samples)
+    none = 0 * s
     sides = {
-        "left": np.stack([0 * s, h * s], axis=1),
-        "right": np.stack([0 * s + w, h * s], axis=1),
-        "top": np.stack([w * s, 0 * s], axis=1),
-        "bottom": np.stack([w * s, 0 * s + h], axis=1),
+        "left": np.stack([none, h * s], axis=1),
+        "right": np.stack([none + w, h * s], axis=1),
+        "top": np.stack([w * s, none], axis=1),
+        "bottom": np.stack([w * s, none + h], axis=1),
     }
     plane = {}
     for name, uv in sides.items():
@@ -352,7 +358,9 @@ def undistorted(camera: CameraModel) -> tuple[StereoCamera, tuple[MapArray, MapA
     The images keep their size and have no invalid border.
     """
     low, high = _inner_rectangle(camera, np.eye(3), "pinhole")
-    f = float(max((camera.width - 1) / (high - low)[0], (camera.height - 1) / (high - low)[1]))
-    cu, cv = np.array([camera.width - 1, camera.height - 1]) / 2 - f * (low + high) / 2
+    span = high - low
+    f = float(max((camera.width - 1) / span[0], (camera.height - 1) / span[1]))
+    last_pixel = np.array([camera.width - 1, camera.height - 1])
+    cu, cv = last_pixel / 2 - f * (low + high) / 2
     out = one_camera(f, f, float(cu), float(cv), camera.width, camera.height)
     return out, lookup(out, camera, np.eye(3))

@@ -190,7 +190,12 @@ class StereoCamera:
         cu = self.cu
         cv = self.cv
         return np.array(
-            [[fu, 0, cu, 0], [0, fv, cv, 0], [fu, 0, cu, -fu * self.baseline_m], [0, fv, cv, 0]],
+            [
+                [fu, 0, cu, 0],
+                [0, fv, cv, 0],
+                [fu, 0, cu, -fu * self.baseline_m],
+                [0, fv, cv, 0],
+            ],
             dtype=np.float64,
         )
 
@@ -199,7 +204,19 @@ class StereoCamera:
         """Intrinsic matrix (3, 3) of both cameras, pixels; of a cylinder, that of the pinhole at
         its middle row.
         """
-        return np.array([[self.fu, 0, self.cu], [0, self.fv, self.cv], [0, 0, 1]], dtype=np.float64)
+        return intrinsic_matrix(self.fu, self.fv, self.cu, self.cv)
+
+
+def intrinsic_matrix(fu: float, fv: float, cu: float, cv: float) -> FloatArray:
+    """Return the matrix (3, 3) of a pinhole's focal lengths and principal point, pixels."""
+    return np.array(
+        [
+            [fu, 0, cu],
+            [0, fv, cv],
+            [0, 0, 1],
+        ],
+        dtype=np.float64,
+    )
 
 
 def one_camera(
@@ -253,9 +270,9 @@ def facing(
     azimuth = (uv[..., 1] - camera.cv) / camera.fv
     s = np.sin(azimuth)
     c = np.cos(azimuth)
-    x, y, z = np.broadcast_arrays(
-        p[..., 0], c * p[..., 1] - s * p[..., 2], s * p[..., 1] + c * p[..., 2]
-    )
+    y_p = p[..., 1]
+    z_p = p[..., 2]
+    x, y, z = np.broadcast_arrays(p[..., 0], c * y_p - s * z_p, s * y_p + c * z_p)
     turned = np.stack([x, y, z], axis=-1)
     return np.stack([uv[..., 0], np.full_like(uv[..., 0], camera.cv)], axis=-1), turned
 
@@ -319,7 +336,8 @@ def triangulate(
     valid = np.isfinite(z).all(axis=-1) & (disparity >= min_disparity_px)
     safe = np.where(valid[..., None], z, 0.0)
     depth = camera.fu * camera.baseline_m / np.where(valid, disparity, 1.0)
-    middle = np.stack([safe[..., 0], (safe[..., 1] + safe[..., 3]) / 2], axis=-1)
+    row = (safe[..., 1] + safe[..., 3]) / 2
+    middle = np.stack([safe[..., 0], row], axis=-1)
     return left_rays(camera, middle) * depth[..., None], valid
 
 

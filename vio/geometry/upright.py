@@ -21,9 +21,13 @@ def upright_axes(T_world_cam0: FloatArray, up_world: FloatArray | None = None) -
             the upper edge of the first image shows.
     """
     first = T_world_cam0[0]
-    up = -first[:3, 1] if up_world is None else np.asarray(up_world, dtype=np.float64)
+    if up_world is None:
+        up = -first[:3, 1]
+    else:
+        up = np.asarray(up_world, dtype=np.float64)
     up = up / np.linalg.norm(up)
-    for ahead in (first[:3, 2], T_world_cam0[-1, :3, 3] - first[:3, 3], *np.eye(3)):
+    towards_end = T_world_cam0[-1, :3, 3] - first[:3, 3]
+    for ahead in (first[:3, 2], towards_end, *np.eye(3)):
         level = ahead - up * (up @ ahead)
         if np.linalg.norm(level) > _LEVEL * max(float(np.linalg.norm(ahead)), 1e-9):
             break
@@ -95,7 +99,9 @@ def rotation_to_up(up: FloatArray) -> FloatArray:
     s = float(np.linalg.norm(axis))
     c = float(up[2])
     if s < 1e-9:
-        return np.eye(3) if c > 0 else so3_exp([np.pi, 0.0, 0.0])
+        if c > 0:
+            return np.eye(3)
+        return so3_exp([np.pi, 0.0, 0.0])
     return so3_exp(axis / s * np.arctan2(s, c))
 
 
@@ -126,7 +132,9 @@ def nearest_yaw(M: FloatArray) -> float:
     """Return the angle of the turn about z that is nearest to a matrix (3, 3), a rotation or a
     sum of some.
     """
-    return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
+    sine = M[1, 0] - M[0, 1]
+    cosine = M[0, 0] + M[1, 1]
+    return float(np.arctan2(sine, cosine))
 
 
 def yaw_and_position(T: FloatArray, T_other: FloatArray) -> FloatArray:
@@ -135,5 +143,6 @@ def yaw_and_position(T: FloatArray, T_other: FloatArray) -> FloatArray:
 
     It is a turn about the vertical and a shift: what two upright worlds may differ by.
     """
-    R = so3_exp(np.array([0.0, 0.0, nearest_yaw(T[:3, :3] @ T_other[:3, :3].T)]))
+    yaw_rad = nearest_yaw(T[:3, :3] @ T_other[:3, :3].T)
+    R = so3_exp(np.array([0.0, 0.0, yaw_rad]))
     return se3_from_parts(R, T[:3, 3] - R @ T_other[:3, 3])

@@ -137,7 +137,10 @@ class ExchangeDetector(ImageCheck):
                 order = "given"
         if order != "refused":
             self._last = now if order == "given" else now[::-1]
-            self._last_halves = (left, right) if order == "given" else (right, left)
+            if order == "given":
+                self._last_halves = (left, right)
+            else:
+                self._last_halves = (right, left)
         self._report(index, order)
         return order
 
@@ -200,4 +203,6 @@ def _judge(found: MatchCounts, likely: Order) -> Order:
         return likely
     if found.negative < 2 * found.positive:
         return "given"
-    return "exchanged" if found.negative >= _EXCHANGE.exchanged_share * found.points else "refused"
+    if found.negative >= _EXCHANGE.exchanged_share * found.points:
+        return "exchanged"
+    return "refused"

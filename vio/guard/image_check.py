@@ -47,7 +47,9 @@ class FrameImages:
 
     def exchanged(self) -> FrameImages:
         """Return the frame with left and right images exchanged."""
-        halves = self.halves[::-1] if "halves" in self.__dict__ else None
+        halves = None
+        if "halves" in self.__dict__:
+            halves = self.halves[::-1]
         return self._copy(halves, raw=self.raw[::-1])
 
     def _copy(self, halves: tuple[Image, ...] | None, **changes: Any) -> FrameImages:

@@ -37,7 +37,9 @@ class LostMatches(MatchCheck):
         """Compare how many features have a right match with how many usually have one."""
         index = seen.frame_index
         state = self._state
-        share = float(seen.has_right.mean()) if len(seen) >= _LOST.min_features else None
+        share = None
+        if len(seen) >= _LOST.min_features:
+            share = float(seen.has_right.mean())
         state.show(index, self._is_lost(share))
         if share is not None and state.since is None:
             usual = share if self._usual is None else self._usual

@@ -122,6 +122,11 @@ def without_right(seen: Observations, dropped: BoolArray | None = None) -> Obser
     """Return features without the right pixels of some rows (N,), of all without a mask; the
     record itself where none has one.
     """
-    has_right = np.zeros(len(seen), dtype=np.bool_) if dropped is None else ~dropped
+    if dropped is None:
+        has_right = np.zeros(len(seen), dtype=np.bool_)
+    else:
+        has_right = ~dropped
     has_right &= seen.has_right
-    return seen if has_right.sum() == seen.has_right.sum() else replace(seen, has_right=has_right)
+    if has_right.sum() == seen.has_right.sum():
+        return seen
+    return replace(seen, has_right=has_right)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.findings import Finder
+from vio.frontend.frames import usable_prior
 from vio.frontend.outliers import (
     Consensus,
     RansacProblem,
@@ -21,7 +22,7 @@ from vio.frontend.outliers import (
     predicted_motion,
     rigid_consensus,
 )
-from vio.frontend.prediction import prior_pixels, usable_prior
+from vio.frontend.prediction import prior_pixels
 from vio.frontend.scene_motion import MovedPoints, SceneMotion
 from vio.frontend.stereo_match import EpipolarRowModel
 from vio.geometry.lie import FloatArray, se3_exp, se3_log

@@ -194,7 +194,9 @@ class PairingCheck(ImageCheck):
             left, right = pairings[delay]
             near = self._probe.near_rows(left.left, right.right, left.corners)
             self._near[delay] = self._near.get(delay, 0) + near
-        return told if self._near[told].max() > self._near[0].max() else None
+        if self._near[told].max() > self._near[0].max():
+            return told
+        return None
 
     def _decide(self, index: int, delay: int) -> None:
         self.delay = delay
@@ -220,7 +222,9 @@ class PairingCheck(ImageCheck):
 
 def _frames_away(delay: int) -> str:
     which = "before" if delay > 0 else "after"
-    return f"the frame {which}" if abs(delay) == 1 else f"{abs(delay)} frames {which}"
+    if abs(delay) == 1:
+        return f"the frame {which}"
+    return f"{abs(delay)} frames {which}"
 
 
 def find_delay(frames: Iterable[StereoFrame], camera: StereoCamera) -> int | None:

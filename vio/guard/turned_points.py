@@ -89,11 +89,15 @@ class TurnedPoints:
     def rotation(self) -> PairRotation | None:
         """Return the rotation of the pairs; None: it is no more than that of usual calibrations."""
         found = self._rotation()
-        return found if np.abs(found.rotation).max() >= np.radians(MIN_TURN_DEG) else None
+        if np.abs(found.rotation).max() >= np.radians(MIN_TURN_DEG):
+            return found
+        return None
 
     def _by_rows(self, z: FloatArray) -> PairRotation | None:
         found = rotation_by_rows(self._camera, z[np.isfinite(z[:, 2])])
-        return found if found is not None and found.share >= _POINTS.min_share else None
+        if found is not None and found.share >= _POINTS.min_share:
+            return found
+        return None
 
     def _rotation(self) -> PairRotation:
         """Return the rotation of all pairs."""

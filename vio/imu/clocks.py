@@ -34,12 +34,16 @@ def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[Iner
         return (_no_overlap(frames, None, 0.0),)
     imu = int(imu_times_ns[0]), int(imu_times_ns[-1])
     covered = float(np.mean((frame_times_ns >= imu[0]) & (frame_times_ns <= imu[1])))
-    step_ns = float(np.median(np.diff(imu_times_ns))) if len(imu_times_ns) > 1 else 0.0
+    step_ns = 0.0
+    if len(imu_times_ns) > 1:
+        step_ns = float(np.median(np.diff(imu_times_ns)))
     if covered == 0.0:
         return (_no_overlap(frames, imu, step_ns),)
     uncovered_s = (1 - covered) * (frames[1] - frames[0]) * S_PER_NS
     enough = covered >= _CLOCKS.min_covered_share or uncovered_s < _CLOCKS.max_uncovered_s
-    return () if enough else (_part_overlap(frames, imu, step_ns, covered),)
+    if enough:
+        return ()
+    return (_part_overlap(frames, imu, step_ns, covered),)
 
 
 class SampleCoverage:
@@ -55,7 +59,8 @@ class SampleCoverage:
 
     def frame(self, time_ns: int, last_imu_ns: int | None) -> None:
         """Count a frame, given the time of the last sample before it."""
-        self._first_ns = time_ns if self._first_ns is None else self._first_ns
+        if self._first_ns is None:
+            self._first_ns = time_ns
         self._last_ns = time_ns
         self._frames += 1
         if last_imu_ns is not None and (time_ns - last_imu_ns) * S_PER_NS <= _CLOCKS.max_late_s:
@@ -72,7 +77,9 @@ class SampleCoverage:
             step_ns: their usual interval.
         """
         long = self._frames >= _NO_IMU_FRAMES and self._seconds >= _NO_IMU_S
-        return [_no_overlap(self._span, imu, step_ns)] if long and self._covered == 0 else []
+        if long and self._covered == 0:
+            return [_no_overlap(self._span, imu, step_ns)]
+        return []
 
     def at_end(self, imu: tuple[int, int] | None, step_ns: float) -> list[InertialFinding]:
         """Report that none or only a part of the frames had samples; arguments as for `so_far`."""
@@ -117,7 +124,9 @@ def _no_overlap(
     lengths = [(span[1] - span[0]) * S_PER_NS for span in (frames, imu)]
     offset_s = (imu[0] - frames[0]) * S_PER_NS
     alike = 0.5 < max(lengths[1], 1e-9) / max(lengths[0], 1e-9) < 2
-    same = f"both last about as long ({lengths[0]:.1f} and {lengths[1]:.1f} s): " if alike else ""
+    same = ""
+    if alike:
+        same = f"both last about as long ({lengths[0]:.1f} and {lengths[1]:.1f} s): "
     return InertialFinding(
         "clocks without overlap",
         seen,

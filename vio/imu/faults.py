@@ -223,7 +223,9 @@ class _Repetition:
             self.repeats += 1
             self.stuck = self.stuck or self._improbable(sample.time_ns)
             return []
-        ended = [self._fault(previous.time_ns)] if self.announced else []
+        ended = []
+        if self.announced:
+            ended = [self._fault(previous.time_ns)]
         for repeated in (*([True] * (0 if self.stuck else self.repeats)), False):
             self._count(repeated)
         self.repeats = 0

@@ -155,7 +155,10 @@ def preintegrate(
     for n in range(int((last - first).max(initial=-1)) + 1):
         # Step n goes to sample first + n, or to the interval's end.
         here = np.minimum(first + n, last)
-        begin = start_s if n == 0 else np.minimum(t[np.minimum(first + n - 1, len(t) - 1)], end_s)
+        if n == 0:
+            begin = start_s
+        else:
+            begin = np.minimum(t[np.minimum(first + n - 1, len(t) - 1)], end_s)
         begin = np.where(first + n > last, end_s, begin)
         end = np.where(here < last, t[np.minimum(here, len(t) - 1)], end_s)
         dt = np.maximum(end - begin, 0.0)
@@ -187,7 +190,8 @@ def preintegrate(
         gap = lacks_samples[after, None]
         # of the mean over the step
         variance = white / np.maximum(h, 1e-12) + np.where(gap, _UNKNOWN, 0.0)
-        P = A @ P @ np.swapaxes(A, 1, 2) + (N * variance[:, None, :]) @ np.swapaxes(N, 1, 2)
+        Q = (N * variance[:, None, :]) @ np.swapaxes(N, 1, 2)
+        P = A @ P @ np.swapaxes(A, 1, 2) + Q
         D = A @ D - N
         p = p + v * h + 0.5 * acceleration * h**2
         v = v + acceleration * h

@@ -95,7 +95,9 @@ def repeated_readings(values: FloatArray) -> int:
         return 0
     usual = round(median(lengths))
     alike = np.mean(np.abs(lengths - usual) <= 1)
-    return usual if usual >= _RATES.min_repeats and alike >= _RATES.alike_share else 0
+    if usual >= _RATES.min_repeats and alike >= _RATES.alike_share:
+        return usual
+    return 0
 
 
 def burst_length(times_ns: IntArray) -> int:
@@ -106,4 +108,6 @@ def burst_length(times_ns: IntArray) -> int:
     if pauses.sum() < _RATES.min_rows or median(steps) >= _RATES.burst_share * mean:
         return 0
     share = float(steps[pauses].sum() / steps.sum())
-    return round(len(steps) / int(pauses.sum())) if share >= _RATES.pauses_share else 0
+    if share >= _RATES.pauses_share:
+        return round(len(steps) / int(pauses.sum()))
+    return 0

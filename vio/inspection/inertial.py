@@ -52,7 +52,10 @@ def rest_part(record: ImuRecord, T_cam0_imu: FloatArray | None) -> Part:
     unit = judge_size(record.times_ns, record.accel)
     if unit.finding is not None:
         faults.append(unit.finding.message)
-    mask = np.repeat(still, size) if still.any() else np.ones(len(record.accel), dtype=np.bool_)
+    if still.any():
+        mask = np.repeat(still, size)
+    else:
+        mask = np.ones(len(record.accel), dtype=np.bool_)
     force = record.accel[: len(mask)][mask].mean(axis=0)
     facts = {
         "still_share": share,
@@ -107,7 +110,10 @@ def noise_part(record: ImuRecord, stated: ImuDensities | None) -> Part | None:
         # add.
         density = min(allan_deviation(values, step_s, tau) * np.sqrt(tau) for tau in _NOISE_TAUS_S)
         facts |= {f"{name}_density": float(density), f"{name}_stated": sheet}
-        of = "" if sheet is None else f" ({density / sheet:.1f} times the stated)"
+        if sheet is None:
+            of = ""
+        else:
+            of = f" ({density / sheet:.1f} times the stated)"
         hint = (
             "; state the measured one" if sheet is not None and density > _OFF_SHEET * sheet else ""
         )

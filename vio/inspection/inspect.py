@@ -121,7 +121,10 @@ def camera_part(recording: Recording) -> Part:
         facts["baseline_m"] = c.baseline_m
     facts |= {"width": c.width or 0, "height": c.height or 0}
     wide = ""
-    faults = [] if c.baseline_fault is None else [c.baseline_fault]
+    if c.baseline_fault is None:
+        faults = []
+    else:
+        faults = [c.baseline_fault]
     if c.width is not None and c.height is not None:
         angles = " x ".join(f"{angle:.0f}" for angle in np.degrees(field_of_view(c)))
         wide = f", {angles} deg"
@@ -285,7 +288,9 @@ def _track(
 def _tracked_part(seen: _Tracked, *, mono: bool) -> Part:
     """Describe how many features were tracked."""
     count = len(seen.tracked)
-    kept = float(np.median(seen.tracked[1:])) if count > 1 else 0.0
+    kept = 0.0
+    if count > 1:
+        kept = float(np.median(seen.tracked[1:]))
     matched = float(np.median(seen.matched or [0]))
     facts = {"frames": count, "tracked_median": kept, "matched_median": matched}
     depth = "" if mono else f", {matched:.0f} with depth"
@@ -435,5 +440,8 @@ def _text(facts: dict[str, float | int | None]) -> str:
         else ", no gap"
     )
     jitter_ms = facts["jitter_ms"] or 0.0
-    jitter = "even" if jitter_ms < _STAMPS.even_ms else f"jitter {jitter_ms:.3g} ms"
+    if jitter_ms < _STAMPS.even_ms:
+        jitter = "even"
+    else:
+        jitter = f"jitter {jitter_ms:.3g} ms"
     return f" in {facts['duration_s']:.2f} s, {facts['rate_hz']:.4g} Hz, {jitter}{gaps}"

@@ -87,7 +87,10 @@ def images_part(frames: Sequence[StereoFrame]) -> Part:
         "clipped": clipped,
         "sharpness": sharpness,
     }
-    gray = f"{means[0]:.0f} left and {means[1]:.0f} right" if cameras == 2 else f"{means[0]:.0f}"
+    if cameras == 2:
+        gray = f"{means[0]:.0f} left and {means[1]:.0f} right"
+    else:
+        gray = f"{means[0]:.0f}"
     text = (
         f"{width} x {height}, mean gray {gray}, at most {100 * clipped:.1f} % at 0 or 255, "
         f"sharpness {sharpness:.1f} (1: blurred by 2 px or more)"
@@ -190,7 +193,10 @@ def rows_part(
             f"the right images are turned by about {turn_deg} degrees against the left ones: turn "
             "them back, or calibrate the pair with images as these"
         ]
-    reading = None if pair is None else other_reading(*pair, z)
+    if pair is None:
+        reading = None
+    else:
+        reading = other_reading(*pair, z)
     if reading is not None:
         faults = [str(reading)]
     return Part("stereo", _rows_text(found, counts), _rows_facts(found), faults), off
@@ -207,7 +213,9 @@ def calibration_part(off: StereoError) -> Part:
 def _size_of_images(frames: Sequence[StereoFrame]) -> tuple[float, float]:
     """Return width and height of the first left image in px; 1, 1: there is none."""
     image = next((f.left for f in frames if f.left is not None), None)
-    return (1.0, 1.0) if image is None else (float(image.shape[1]), float(image.shape[0]))
+    if image is None:
+        return (1.0, 1.0)
+    return (float(image.shape[1]), float(image.shape[0]))
 
 
 def _unmatched_part(why: NotObservable, counts: Sequence[int]) -> Part:
@@ -224,7 +232,9 @@ def _unmatched_part(why: NotObservable, counts: Sequence[int]) -> Part:
 
 def _rows_text(found: RowResiduals, counts: Sequence[int]) -> str:
     field = found.grid_px[np.isfinite(found.grid_px)]
-    over = f", {field.min():+.2f} to {field.max():+.2f} over the image" if len(field) else ""
+    over = ""
+    if len(field):
+        over = f", {field.min():+.2f} to {field.max():+.2f} over the image"
     return (
         f"{np.median(counts):.0f} matches a pair, rows {found.median_px:+.2f} px (median of vl - "
         "vr), spread "
@@ -283,7 +293,9 @@ def _turn_between(frames: Sequence[StereoFrame]) -> int:
     quarters = np.round(all_turns / 90).astype(int) % 4
     counts = np.bincount(quarters, minlength=4)
     most = int(counts.argmax())
-    return 90 * most if 2 * counts[most] > len(all_turns) else 0
+    if 2 * counts[most] > len(all_turns):
+        return 90 * most
+    return 0
 
 
 def sift_points(left: Image, right: Image) -> list[tuple[cv2.KeyPoint, cv2.KeyPoint]]:

@@ -62,7 +62,8 @@ def from_pinhole_cameras(cameras: Any) -> tuple[StereoCamera, FloatArray]:
             "the left one's x axis; rectify them first"
         )
     size = (int(cameras.width[0]), int(cameras.height[0]))
-    pair = StereoCamera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], -float(T_cam1_cam0[0, 3]), *size)
+    baseline_m = -float(T_cam1_cam0[0, 3])
+    pair = StereoCamera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], baseline_m, *size)
     return pair, checked_transform(T_cam0_world, "PinholeCamera")
 
 

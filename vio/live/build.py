@@ -75,7 +75,10 @@ class Source:
         """Return what tries other readings of the calibration; None: it is of rectified images, or
         of one camera.
         """
-        pair = pair_as_read(self.features) if self.rectifier is None else raw_pair(self.rectifier)
+        if self.rectifier is None:
+            pair = pair_as_read(self.features)
+        else:
+            pair = raw_pair(self.rectifier)
         return None if pair is None else ReadingCheck(*pair)
 
 
@@ -203,7 +206,9 @@ def _frontend(source: Source, config: Config, parts: Parts, seen: StereoCamera) 
     from vio.frontend.given import as_frontend  # they load OpenCV
     from vio.frontend.precomputed import PrecomputedFrontend
 
-    name = config.frontend.name if config.frontend.features is None else "precomputed"
+    name = "precomputed"
+    if config.frontend.features is None:
+        name = config.frontend.name
     if parts.frontend is None:
         frontend = build_frontend(name, seen, config.frontend, source.features)
     else:
@@ -259,7 +264,10 @@ def build_processor(
         reading=source.reading_check(),
         extrinsics_known=config.msckf.calibrate_camera_imu not in ("extrinsics", "both"),
     )
-    session = None if map is None else _open_map(map, source, config, backend)
+    if map is None:
+        session = None
+    else:
+        session = _open_map(map, source, config, backend)
     return EventProcessor(pipeline, wait_for_imu=source.motion == "imu", map=session)
 
 

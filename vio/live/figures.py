@@ -99,7 +99,10 @@ class LiveMonitor:
         self.results += 1
         self._latencies_s.append(latency)
         self._worst_s = max(self._worst_s, latency)
-        self._late = self._late + 1 if latency > _FIGURES.late_s else 0
+        if latency > _FIGURES.late_s:
+            self._late = self._late + 1
+        else:
+            self._late = 0
         left_out = sum(self._left_out)
         if (
             self._warned
@@ -108,7 +111,9 @@ class LiveMonitor:
         ):
             return None
         self._warned = True
-        lost = f", {left_out} of the last {len(self._left_out)} frames left out" if left_out else ""
+        lost = ""
+        if left_out:
+            lost = f", {left_out} of the last {len(self._left_out)} frames left out"
         return f"falling behind by {latency:.1f} s{lost}: use --config fast, or set dataset.max_frame_rate"
 
     def figures(self, waiting: int) -> LiveFigures:

@@ -127,7 +127,10 @@ class Inputs:
         if given != self._camera:
             raise DataError(f"{_CAME[given]} came, but this rig takes {_TAKES[self._camera]}")
         images = self._checked_images(left, right)
-        depth = None if depth_m is None else checked_depths(depth_m, images[0].shape[:2])
+        if depth_m is None:
+            depth = None
+        else:
+            depth = checked_depths(depth_m, images[0].shape[:2])
         numbered = self._numbered(t_ns, "images")
         if numbered is None:
             return None
@@ -264,7 +267,10 @@ class _Stamps:
         last_ns = self._last_ns
         step_ns = 0 if last_ns is None else time_ns - last_ns
         if step_ns > max(_STAMPS.jump_ns, _STAMPS.jump_steps * self._step_ns) and self._step_ns:
-            since_held_ns = 0 if self._held_ns is None else time_ns - self._held_ns
+            if self._held_ns is None:
+                since_held_ns = 0
+            else:
+                since_held_ns = time_ns - self._held_ns
             # as of a camera whose frames come so slowly, after a first step that was quicker
             is_as_long = 2 * since_held_ns >= step_ns - since_held_ns >= since_held_ns // 2 > 0
             if not (0 < since_held_ns <= _STAMPS.jump_ns or is_as_long):
@@ -367,7 +373,9 @@ def checked_observations(
         seen = observations(index, 0, ids, z, has_right)
     except (ValueError, TypeError) as error:
         raise DataError(f"observations at {time_ns} ns: {error}") from error
-    used = np.concatenate([seen.z[:, :2].ravel(), seen.z[seen.has_right, 2:].ravel()])
+    left = seen.z[:, :2]
+    right = seen.z[seen.has_right, 2:]
+    used = np.concatenate([left.ravel(), right.ravel()])
     wrong = int((~(np.abs(used) < LARGEST)).sum())
     if wrong:
         raise DataError(

@@ -207,7 +207,9 @@ class Odometry(EventInputs["Estimate | None"]):
             if self._rectifier is not None:
                 shapes = _image_shapes(self.camera, self._rectifier)
                 black = [np.zeros(shape or (1, 1), dtype=np.uint8) for shape in shapes]
-                depth = np.zeros(black[0].shape) if self.camera.kind == "rgbd" else None
+                depth = None
+                if self.camera.kind == "rgbd":
+                    depth = np.zeros(black[0].shape)
                 self._rectifier.frame(0, 0, *black, depth_m=depth)
 
     # What comes out
@@ -377,8 +379,13 @@ def _image_shapes(camera: StereoCamera, rectifier: Rectifier | None) -> Shapes:
     if rectifier is not None and camera.kind == "stereo":
         rig = rectifier.rig
         return (rig.cam0.height, rig.cam0.width), (rig.cam1.height, rig.cam1.width)
-    shape = None if camera.width is None or camera.height is None else (camera.height, camera.width)
-    return (shape, shape) if camera.kind == "stereo" else (shape,)
+    if camera.width is None or camera.height is None:
+        shape = None
+    else:
+        shape = (camera.height, camera.width)
+    if camera.kind == "stereo":
+        return (shape, shape)
+    return (shape,)
 
 
 class _LiveFrontend:

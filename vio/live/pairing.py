@@ -36,4 +36,6 @@ class Pairing(Generic[T]):
             for t in [t for t in waiting if t < max(near, time_ns)]:
                 waiting.pop(t)
                 self.alone += 1
-        return (time_ns, image, partner) if side == 0 else (near, partner, image)
+        if side == 0:
+            return (time_ns, image, partner)
+        return (near, partner, image)

@@ -89,8 +89,12 @@ class PosePredictor:
         gyro_bias = _ZERO if estimate.gyro_bias is None else estimate.gyro_bias
         accel_bias = _ZERO if estimate.accel_bias is None else estimate.accel_bias
         self._bias = gyro_bias, accel_bias
-        self._matrices = None if estimate.imu_terms is None else imu_matrices(estimate.imu_terms)
-        self._gravity = self._gravity if estimate.gravity_world is None else estimate.gravity_world
+        if estimate.imu_terms is None:
+            self._matrices = None
+        else:
+            self._matrices = imu_matrices(estimate.imu_terms)
+        if estimate.gravity_world is not None:
+            self._gravity = estimate.gravity_world
         omega, v = self._motion_of(estimate)
         state = _State(
             estimate.time_ns,
@@ -190,7 +194,9 @@ class PosePredictor:
 
 def _moved(state: _State, dt: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     R = state.R @ so3_exp(state.gyro * dt)
-    return R, state.p + state.v * dt + 0.5 * state.accel * dt**2, state.v + state.accel * dt
+    p = state.p + state.v * dt + 0.5 * state.accel * dt**2
+    v = state.v + state.accel * dt
+    return R, p, v
 
 
 class SharedPredictor:

@@ -187,7 +187,10 @@ class EventProcessor:
             frame = step.frame
             if step.samples:
                 self.pipeline.samples(step.samples)
-            result = None if frame is None else self.pipeline.frame(frame)
+            if frame is None:
+                result = None
+            else:
+                result = self.pipeline.frame(frame)
             if frame is not None and result is not None:
                 results.append(self._in_map(frame, result))
                 self.estimate = results[-1].estimate

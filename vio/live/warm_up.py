@@ -113,7 +113,9 @@ class SwayingCamera:
         self._size = camera.width, camera.height
         rows = camera.height // 2
         # A single camera's baseline is 1 m or made up: its walls are at some metres.
-        far_m = camera.fu * camera.baseline_m / _RUN.far_px if camera.kind == "stereo" else 4.0
+        far_m = 4.0
+        if camera.kind == "stereo":
+            far_m = camera.fu * camera.baseline_m / _RUN.far_px
         self._px_per_m = np.array([1.0, 2.0]) * camera.fu / far_m
         self._sway_m = _RUN.sway_px / self._px_per_m[1]
         self._depth_m: FloatArray = np.full((camera.height, camera.width), far_m)
@@ -140,7 +142,9 @@ class SwayingCamera:
         camera has them.
         """
         x, *_ = self.motion(time_ns * 1e-9)
-        right = self._image(x + self._camera.baseline_m) if self._camera.kind == "stereo" else None
+        right = None
+        if self._camera.kind == "stereo":
+            right = self._image(x + self._camera.baseline_m)
         return self._image(x), right, self._depth_m if self._camera.kind == "rgbd" else None
 
     def motion(self, time_s: float) -> tuple[float, float, float]:
@@ -152,7 +156,10 @@ class SwayingCamera:
         rate = 2.0 * np.pi / _RUN.sway_s
         phase = rate * time_s
         a = 0.5 * self._sway_m
-        return a * (1 - np.cos(phase)), a * rate * np.sin(phase), a * rate**2 * np.cos(phase)
+        position = a * (1 - np.cos(phase))
+        velocity = a * rate * np.sin(phase)
+        acceleration = a * rate**2 * np.cos(phase)
+        return position, velocity, acceleration
 
     def _image(self, x_m: float) -> Image:
         """Return the image (H, W) of a camera at a position along x."""
@@ -160,7 +167,12 @@ class SwayingCamera:
 
         out = np.empty(self._size[::-1], dtype=np.uint8)
         for rows, px_per_m in zip(self._rows, self._px_per_m.tolist(), strict=True):
-            shift = np.array([[1.0, 0.0, -(px_per_m * x_m + _RUN.near_px)], [0.0, 1.0, 0.0]])
+            shift = np.array(
+                [
+                    [1.0, 0.0, -(px_per_m * x_m + _RUN.near_px)],
+                    [0.0, 1.0, 0.0],
+                ]
+            )
             size = self._size[0], rows.stop - rows.start
             out[rows] = cv2.warpAffine(self._texture[rows], shift, size, flags=cv2.INTER_LINEAR)
         return out

@@ -99,7 +99,10 @@ def _is_alike(a: StereoCamera, b: StereoCamera) -> bool:
 
 
 def _text(camera: StereoCamera) -> str:
-    size = "" if camera.width is None else f"{camera.width}x{camera.height} pixels, "
+    if camera.width is None:
+        size = ""
+    else:
+        size = f"{camera.width}x{camera.height} pixels, "
     kind = "a stereo pair" if camera.kind == "stereo" else "one camera"
     return f"{kind} ({camera.projection}, {size}focal length {camera.fu:.1f} px, baseline {camera.baseline_m:.4f} m)"
 
@@ -173,7 +176,10 @@ class MapBuilder:
         sessions = self.graph.sessions
         self._own = len(sessions)
         # the part whose frame is the map's
-        self._home = sessions[0].part if sessions else self._own
+        if sessions:
+            self._home = sessions[0].part
+        else:
+            self._home = self._own
         sessions.append(SessionRow(source, camera, upright, self._own))
         if not localise:
             store.add_session(sessions[-1])
@@ -367,7 +373,10 @@ class MapBuilder:
         T_map_odom = (
             graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k]) if self._optimised else np.eye(4)
         )
-        T_map_cam = None if self.places.newest is None else graph.T_map_cam[k].copy()
+        if self.places.newest is None:
+            T_map_cam = None
+        else:
+            T_map_cam = graph.T_map_cam[k].copy()
         return MapUpdate(T_map_odom, T_map_cam, self._covariance(k, rig_sigmas), events)
 
     def _covariance(self, k: int, rig_sigmas: tuple[float, float]) -> FloatArray:
@@ -440,6 +449,9 @@ class MapBuilder:
         settled = self._optimised and squared(r, pose.covariance) <= _SETTLING.settled_error
         if joined or not settled or self._waiting >= _SETTLING.waiting_loops:
             self._optimise()
+        keyframe_frame = None
+        if graph.session[i] == self._own:
+            keyframe_frame = graph.frame(i)
         return LoopEvent(
             frame=graph.frame(k),
             time_ns=graph.time_ns(k),
@@ -448,7 +460,7 @@ class MapBuilder:
             inliers=row.inliers,
             gap_m=float(np.linalg.norm(r[:3])),
             joined=joined,
-            keyframe_frame=graph.frame(i) if graph.session[i] == self._own else None,
+            keyframe_frame=keyframe_frame,
             matches=loop.seen.matches,
         )
 

@@ -34,7 +34,10 @@ def spread(T_map_cam: FloatArray, part: IntArray, loops: IntArray, density: int)
         np.fill_diagonal(apart, np.inf)
         for _ in range(len(rows) - density):
             a, b = sorted(np.unravel_index(int(np.argmin(apart)), apart.shape))
-            gone = b if loops[rows[b]] < loops[rows[a]] else a
+            if loops[rows[b]] < loops[rows[a]]:
+                gone = b
+            else:
+                gone = a
             kept[rows[gone]] = False
             apart[gone] = np.inf
             apart[:, gone] = np.inf

@@ -169,7 +169,8 @@ def _right_pixels(
     i, j = _near_rows(uv[:, 1], at[:, 1], _EXTRACTION.rows_px * scale)
     shift = uv[i, 0] - at[j, 0]
     allowed = (shift > -1.0) & (shift < _KEY_POINTS.max_disparity_share * left.shape[1])
-    allowed &= np.abs(np.log(scale[i] / size[j])) < 1.5 * np.log(_KEY_POINTS.scale)
+    log_ratio = np.log(scale[i] / size[j])
+    allowed &= np.abs(log_ratio) < 1.5 * np.log(_KEY_POINTS.scale)
     rows, best = _most_alike(i[allowed], j[allowed], bits, np.asarray(there_bits, dtype=np.uint8))
     if not len(rows):
         return out, valid
@@ -184,8 +185,10 @@ def _right_pixels(
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     found = refined[:, 0].astype(np.float64)
-    good = (status[:, 0] > 0) & (np.abs(found[:, 1] - uv[rows, 1]) <= _EXTRACTION.lk_rows_px)
-    good &= np.abs(found[:, 0] - start[:, 0, 0]) <= _EXTRACTION.rows_px * scale[rows]
+    off_row_px = np.abs(found[:, 1] - uv[rows, 1])
+    good = (status[:, 0] > 0) & (off_row_px <= _EXTRACTION.lk_rows_px)
+    off_start_px = np.abs(found[:, 0] - start[:, 0, 0])
+    good &= off_start_px <= _EXTRACTION.rows_px * scale[rows]
     good &= uv[rows, 0] - found[:, 0] >= DEPTH_DISPARITY_PX
     out[rows[good]] = found[good]
     valid[rows[good]] = True
@@ -200,7 +203,8 @@ def _near_rows(v: FloatArray, there: FloatArray, reach: FloatArray) -> tuple[Int
     begin = np.searchsorted(there[order], v - reach, side="left")
     counts = np.searchsorted(there[order], v + reach, side="right") - begin
     i = np.repeat(np.arange(len(v)), counts)
-    return i, order[np.arange(len(i)) + np.repeat(begin - np.cumsum(counts) + counts, counts)]
+    shift = begin - np.cumsum(counts) + counts
+    return i, order[np.arange(len(i)) + np.repeat(shift, counts)]
 
 
 def _most_alike(i: IntArray, j: IntArray, a: Bits, b: Bits) -> tuple[IntArray, IntArray]:

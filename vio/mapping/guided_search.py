@@ -130,7 +130,8 @@ class PlacePoints:
                 [np.broadcast_to(np.eye(3), (len(seen.p), 3, 3)), -so3_hat(seen.p)], axis=2
             )
             R = place.T_i_j[:3, :3]
-            P[own] = R @ (seen.covariance + D @ place.covariance @ np.swapaxes(D, 1, 2)) @ R.T
+            by_place = D @ place.covariance @ np.swapaxes(D, 1, 2)
+            P[own] = R @ (seen.covariance + by_place) @ R.T
         return StereoPoints(self.p, P, np.ones(len(P), dtype=np.bool_))
 
     def fields(self) -> list[DisplacementField | None]:
@@ -287,7 +288,9 @@ def _of_one_segment(
     measurement.
     """
     own = agree[points.take(agree).main_segment()]
-    return own if _corners(here.z[rows[own]]) >= MIN_CORNERS else agree
+    if _corners(here.z[rows[own]]) >= MIN_CORNERS:
+        return own
+    return agree
 
 
 def _guided(
@@ -315,7 +318,9 @@ def _in_reach(place: PlacePoints, camera: StereoCamera, T_i_k: FloatArray) -> In
     margin = _GUIDANCE.max_window_px + _GUIDANCE.aside_px
     w = camera.width or np.inf
     h = camera.height or np.inf
-    return ahead[(uv > -margin).all(axis=1) & (uv < [w + margin, h + margin]).all(axis=1)]
+    after_begin = (uv > -margin).all(axis=1)
+    before_end = (uv < [w + margin, h + margin]).all(axis=1)
+    return ahead[after_begin & before_end]
 
 
 class _Target(NamedTuple):
@@ -361,8 +366,13 @@ def _pairs(
     uv = np.zeros((len(place.p), 2))
     radius = np.zeros(len(place.p))
     size = place.size_px.copy()
-    C = np.zeros((6, 6)) if covariance is None else _SIGMAS**2 * covariance
-    camera = np.array([c.fu, c.fv, c.cu, c.cv, c.width or np.inf, c.height or np.inf])
+    if covariance is None:
+        C = np.zeros((6, 6))
+    else:
+        C = _SIGMAS**2 * covariance
+    width = c.width or np.inf
+    height = c.height or np.inf
+    camera = np.array([c.fu, c.fv, c.cu, c.cv, width, height])
     points = _SeenFrom(place.p, place.eye)
     pose = _Pose(se3_inverse(T_i_k), T_i_k[:3, 3], C)
     _predict(points, pose, camera, uv, radius, size)

@@ -137,14 +137,18 @@ def verify(
         pairs = pairs[np.linspace(0, len(pairs) - 1, _FITTING.max_pairs).astype(np.int64)]
     a, b = pairs.T
     T_j_i = _pnp(camera_i, i, a, camera_j, j, b)
-    T_i_j = None if T_j_i is None else _pnp(camera_j, j, b, camera_i, i, a)
+    if T_j_i is None:
+        T_i_j = None
+    else:
+        T_i_j = _pnp(camera_j, j, b, camera_i, i, a)
     if T_j_i is None or T_i_j is None:
         return None
     depth = _median_depth(camera_j, j, b)
     gap = se3_log(T_i_j @ T_j_i)
-    if np.linalg.norm(gap[:3]) > _FITTING.same_m + _FITTING.same_depth * depth or np.linalg.norm(
-        gap[3:]
-    ) > np.radians(_FITTING.same_deg):
+    apart_m = np.linalg.norm(gap[:3])
+    apart_rad = np.linalg.norm(gap[3:])
+    same_m = _FITTING.same_m + _FITTING.same_depth * depth
+    if apart_m > same_m or apart_rad > np.radians(_FITTING.same_deg):
         return None
     fitted = _fit(camera_i, i, a, camera_j, j, b, T_i_j)
     if fitted is None:
@@ -171,7 +175,9 @@ def _points(
 
 def _median_depth(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> float:
     p, valid = _points(camera, f, rows)
-    return float(np.median(p[valid, 2])) if valid.any() else 0.0
+    if not valid.any():
+        return 0.0
+    return float(np.median(p[valid, 2]))
 
 
 def _pnp(
@@ -204,11 +210,10 @@ def pose_of_most(
     """
     if len(p) < least:
         return None
-    K = np.array([[camera.fu, 0, camera.cu], [0, camera.fv, camera.cv], [0, 0, 1.0]])
     done, rotation, translation, inliers = cv2.solvePnPRansac(
         p,
         uv,
-        K,
+        camera.K,
         None,
         iterationsCount=_FITTING.ransac_steps,
         reprojectionError=_FITTING.ransac_px,
@@ -297,10 +302,20 @@ def covariance_by_shifts(
         return normal, pull
 
     normal, pull = step(terms)
-    P = 1e-9 * np.eye(6) if prior is None else np.linalg.inv(prior.covariance)
-    pulls = [step(terms.shifted(dp[..., s], dz[..., s]))[1] - pull for s in range(dp.shape[-1])]
+    P = _information(prior)
+    pulls = []
+    for s in range(dp.shape[-1]):
+        shifted = terms.shifted(dp[..., s], dz[..., s])
+        pulls.append(step(shifted)[1] - pull)
     xi = np.linalg.solve(normal + P, np.transpose(pulls))
     return np.asarray(xi @ xi.T)
+
+
+def _information(prior: RelativePose | None) -> FloatArray:
+    """Information (6, 6) of a prior; without one enough for the equations to have a solution."""
+    if prior is None:
+        return 1e-9 * np.eye(6)
+    return np.asarray(np.linalg.inv(prior.covariance))
 
 
 def fit_terms(
@@ -323,7 +338,7 @@ def fit_terms(
     """
     T = T_i_j
     normal = np.eye(6)
-    P = 1e-9 * np.eye(6) if prior is None else np.asarray(np.linalg.inv(prior.covariance))
+    P = _information(prior)
     squared = np.zeros(sum(len(part.stereo) for part in parts))
     for step in range(_FITTING.max_steps):
         width = _FITTING.gate * 2.0 ** max(2 - step, 0)

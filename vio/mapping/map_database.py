@@ -448,7 +448,8 @@ def _arrays(
         return out, (int(np.argmin(finite)), "a number is not finite")
     if shape == (4, 4) and len(out):
         R = out[:, :3, :3]
-        rigid = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) <= _ROTATION_TOLERANCE
+        off_identity = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3))
+        rigid = off_identity.max(axis=(1, 2)) <= _ROTATION_TOLERANCE
         rigid &= (out[:, 3] == (0, 0, 0, 1)).all(axis=1)
         if not rigid.all():
             return out, (int(np.argmin(rigid)), "a pose is none")

@@ -208,7 +208,8 @@ class MapGraph:
         late = np.maximum(i, k)
         early = np.minimum(i, k)
         A = se3_adjoint(se3_inverse(self.T_odom_cam[late]))
-        C: FloatArray = A @ (self._drift[late] - self._drift[early]) @ np.swapaxes(A, 1, 2)
+        between = self._drift[late] - self._drift[early]
+        C: FloatArray = A @ between @ np.swapaxes(A, 1, 2)
         if systematic:
             path = (self.path_m[late] - self.path_m[early])[:, None]
             sigma = systematic * path * np.repeat([_DRIFT_SHARE, _DRIFT_RAD_PER_M], 3)
@@ -275,7 +276,9 @@ class MapGraph:
         B = T_before[stays]
         p = w @ T[:, :3, 3]
         q = w @ B[:, :3, 3]
-        M = np.einsum("k,ki,kj->ij", w, B[:, :3, 3] - q, T[:, :3, 3] - p)
+        from_q = B[:, :3, 3] - q
+        from_p = T[:, :3, 3] - p
+        M = np.einsum("k,ki,kj->ij", w, from_q, from_p)
         # directions, which a straight path leaves open
         M += np.einsum("k,kia,kja->ij", w, B[:, :3, :3], T[:, :3, :3])
         if level and self._is_upright(rows):
@@ -321,7 +324,9 @@ class MapGraph:
                 return before
             since = self.drift(np.array([before.keyframe]), np.array([newest]), systematic=0.0)[0]
             if self.odometry_scale * since[:3, :3].trace() < loop.pose.covariance[:3, :3].trace():
-                R = self.T_map_cam[newest][:3, :3].T @ self.T_map_cam[before.keyframe][:3, :3]
+                R_newest = self.T_map_cam[newest][:3, :3]
+                R_before = self.T_map_cam[before.keyframe][:3, :3]
+                R = R_newest.T @ R_before
                 A = np.kron(np.eye(2), R)
                 return replace(before, keyframe=newest, covariance=A @ before.covariance @ A.T)
         w = self.frame_weights(stays)
@@ -386,12 +391,15 @@ class MapGraph:
         inside = [n for n, o in enumerate(self.loops) if rows[o.first] and rows[o.second]]
         up_directions = self._up_directions(rows)
         T_upright_map = se3_from_parts(self._level_of(fixed), np.zeros(3))
+        levelled = None
+        if level and len(up_directions.pose):
+            levelled = 0
         best = optimise(
             T_upright_map @ self.T_map_cam.rows[rows],
             *self._edges(rows, inside),
             up_directions,
             fixed[rows],
-            levelled=0 if level and len(up_directions.pose) else None,
+            levelled=levelled,
         )
         self.T_map_cam.rows[rows] = se3_inverse(T_upright_map) @ best.T_map_cam
         for n, kept in zip(inside, best.kept.tolist(), strict=True):
@@ -418,7 +426,9 @@ class MapGraph:
 
     def _up_directions(self, rows: BoolArray) -> UpDirections:
         place = np.cumsum(rows) - 1
-        ups = [up for up in self._ups if rows[up[0]]] if self._is_upright(rows) else []
+        ups = []
+        if self._is_upright(rows):
+            ups = [up for up in self._ups if rows[up[0]]]
         return UpDirections(
             np.array([place[k] for k, _, _ in ups], dtype=np.int64),
             np.array([up for _, up, _ in ups]).reshape(-1, 3),
@@ -447,7 +457,8 @@ class MapGraph:
 
 def _links(motions: Sequence[tuple[int, int, RelativePose]]) -> FloatArray:
     """Return the keyframes of motions and the variances of their positions (M, 3)."""
-    variance = [m.covariance[0, 0] + m.covariance[1, 1] + m.covariance[2, 2] for _, _, m in motions]
+    covariances = [motion.covariance for _, _, motion in motions]
+    variance = [P[0, 0] + P[1, 1] + P[2, 2] for P in covariances]
     return np.array([(i, j, v) for (i, j, _), v in zip(motions, variance, strict=True)]).reshape(
         -1, 3
     )
@@ -485,4 +496,7 @@ def _nearest(links: coo_matrix, new: Sequence[LoopRow], rows: BoolArray) -> IntA
             joined.all() and nearest[chosen[-1]] <= 2 * (reach - float(least.max()))
         ):
             return chosen[np.isfinite(nearest[chosen])]
-        reach = _GRAPH.further * reach if reach < links.data.sum() else np.inf
+        if reach < links.data.sum():
+            reach = _GRAPH.further * reach
+        else:
+            reach = np.inf

@@ -146,7 +146,10 @@ class MapStore(MapDatabase):
     def add_keyframe(self, row: KeyframeRow, features: KeyframeFeatures) -> int:
         """Add a keyframe and return its number."""
         number = self._count("keyframes")
-        up = None if row.up_cam is None else _blob(row.up_cam)
+        if row.up_cam is None:
+            up = None
+        else:
+            up = _blob(row.up_cam)
         poses = _blob(row.T_map_cam), _blob(row.T_odom_cam), _blob(row.drift)
         self._insert(
             "keyframes",
@@ -332,7 +335,9 @@ class MapStore(MapDatabase):
         ) -> EarthRow:
             return EarthRow((_number(latitude), _number(longitude), _number(height)), T, C)
 
-        rows = self._read("earth", made) if self.version >= SINCE["earth"] else []
+        rows = []
+        if self.version >= SINCE["earth"]:
+            rows = self._read("earth", made)
         return rows[0] if rows else None
 
     def places(self) -> list[PlacesRow]:
@@ -347,7 +352,9 @@ class MapStore(MapDatabase):
             p = np.frombuffer(points, dtype="<f8").reshape(SEGMENT, -1, 3)
             return PlacesRow(words, p, np.frombuffer(stereo, dtype="<i8").reshape(SEGMENT))
 
-        return self._read("places", made) if self.version >= SINCE["places"] else []
+        if self.version >= SINCE["places"]:
+            return self._read("places", made)
+        return []
 
     def show_something(self) -> BoolArray:
         """Mask (K,) of the keyframes that have features."""
@@ -390,7 +397,10 @@ def _field_of(
 ) -> DisplacementField | None:
     if coefficients is None:
         return None
-    P = None if covariance is None else _array(covariance, TERMS, TERMS)
+    if covariance is None:
+        P = None
+    else:
+        P = _array(covariance, TERMS, TERMS)
     return DisplacementField(camera, _array(coefficients, TERMS), P)
 
 

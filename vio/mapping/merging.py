@@ -355,7 +355,8 @@ def _merge_earth(store: MapStore, other: MapStore) -> None:
     )
     A = se3_adjoint(se3_inverse(T_other_store[middle]))
     B = se3_adjoint(T_now[middle])
-    covariance = A @ earth.covariance @ A.T + B @ (xi.T @ xi / len(xi)) @ B.T
+    scatter = xi.T @ xi / len(xi)
+    covariance = A @ earth.covariance @ A.T + B @ scatter @ B.T
     store.set_earth(
         replace(earth, T_enu_map=earth.T_enu_map @ T_other_store[middle], covariance=covariance)
     )

@@ -56,12 +56,15 @@ class Overlaps:
             camera: the camera.
             T_map_here: (4, 4) its pose.
         """
-        p = self._points[rows] @ np.swapaxes(T_map_cam[:, :3, :3], 1, 2) + T_map_cam[:, None, :3, 3]
+        R_cam_map = np.swapaxes(T_map_cam[:, :3, :3], 1, 2)
+        p = self._points[rows] @ R_cam_map + T_map_cam[:, None, :3, 3]
         q = transform_points(se3_inverse(T_map_here), p)
         ok = is_visible(p, T_map_cam[:, None, :3, 3], q, T_map_here[:3, 3])
         uv = project(camera, np.where(ok[..., None], q, [0.0, 0.0, 1.0]))
         ok &= (uv[..., :2] > 0).all(axis=-1)
-        ok &= (uv[..., 0] < (camera.width or np.inf)) & (uv[..., 1] < (camera.height or np.inf))
+        width = camera.width or np.inf
+        height = camera.height or np.inf
+        ok &= (uv[..., 0] < width) & (uv[..., 1] < height)
         out: FloatArray = ok.mean(axis=1) * self._count[rows]
         return out
 

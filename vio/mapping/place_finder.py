@@ -171,7 +171,9 @@ class PlaceFinder:
         seen = search(
             views, self._camera, self.features(k), loop.pose if prior is None else prior, prior
         )
-        return None if seen is None else replace(loop, pose=seen.pose, inliers=seen.inliers)
+        if seen is None:
+            return None
+        return replace(loop, pose=seen.pose, inliers=seen.inliers)
 
     def remember(self, camera: StereoCamera, features: KeyframeFeatures) -> None:
         """Let the next keyframe be found again."""
@@ -265,7 +267,9 @@ class PlaceFinder:
         if seen is None:
             return None
         refined = _as_place(views, k, seen, features, loop.needed)
-        return refined if self.fits(refined.first, k, refined.seen, drift) else None
+        if not self.fits(refined.first, k, refined.seen, drift):
+            return None
+        return refined
 
     def _search(
         self, number: int, features: KeyframeFeatures, allowed: BoolArray
@@ -302,7 +306,8 @@ class PlaceFinder:
         graph = self._graph
         rows = rows[graph.part[rows] == graph.part[k]]
         drift = self.drift_since(rows, k, systematic=_PLACES.guided_share)
-        known = np.flatnonzero(np.trace(drift[:, :3, :3], axis1=1, axis2=2) < _PLACES.guided_m**2)
+        variance = np.trace(drift[:, :3, :3], axis1=1, axis2=2)
+        known = np.flatnonzero(variance < _PLACES.guided_m**2)
         T = se3_inverse(graph.T_map_cam[rows[known]]) @ graph.T_map_cam[k]
         return {int(rows[n]): RelativePose(T[m], drift[n]) for m, n in enumerate(known.tolist())}
 
@@ -370,7 +375,9 @@ class PlaceFinder:
     def _median_depth(self, features: KeyframeFeatures) -> float | None:
         p, valid = triangulate(self._camera, features.z, min_disparity_px=1.0)
         valid &= features.has_right
-        return float(np.median(p[valid, 2])) if valid.any() else None
+        if not valid.any():
+            return None
+        return float(np.median(p[valid, 2]))
 
     def drift_since(self, i: IntArray, k: int, *, systematic: float = 1.0) -> FloatArray:
         """Covariance (N, 6, 6) of the motion from keyframes i (N,) to k, in the frame of k, before
@@ -410,7 +417,8 @@ class PlaceFinder:
         near_path = (passed < _PLACES.revisit_depths * depth) & (sigma < _PLACES.lost_m)
         recent = own & ((np.arange(count) > number - _PLACES.recent) | near_path)
         T = se3_inverse(graph.T_map_cam[number]) @ graph.T_map_cam[:count]
-        near = np.linalg.norm(T[:, :3, 3], axis=1) <= _PLACES.view_depths * depth + _SIGMAS * sigma
+        distance_m = np.linalg.norm(T[:, :3, 3], axis=1)
+        near = distance_m <= _PLACES.view_depths * depth + _SIGMAS * sigma
         ahead = np.arccos(np.clip(T[:, 2, 2], -1.0, 1.0)) <= _VIEW_RAD
         part = graph.part
         unknown = (part[:count] != part[number]) | (sigma > 0.5 * UNKNOWN**0.5)

@@ -169,7 +169,10 @@ class PlaceIndex:
 
     def _room(self, size: int) -> Owners:
         count = max(len(self), self._merged)
-        kind = np.min_scalar_type(count) if count > np.iinfo(np.uint16).max else np.dtype(np.uint16)
+        if count > np.iinfo(np.uint16).max:
+            kind = np.min_scalar_type(count)
+        else:
+            kind = np.dtype(np.uint16)
         return np.empty((_WORD_RULES.tables, size), dtype=kind)
 
     def _merge(self) -> None:

@@ -61,11 +61,15 @@ class Edges:
     @classmethod
     def of(cls, rows: Sequence[tuple[int, int, RelativePose]]) -> Edges:
         """Collect edges (i, j, motion)."""
+        first = [i for i, _, _ in rows]
+        second = [j for _, j, _ in rows]
+        poses = [pose for _, _, pose in rows]
+        covariance = np.array([pose.covariance for pose in poses]).reshape(-1, 6, 6)
         return cls(
-            np.array([i for i, _, _ in rows], dtype=np.int64),
-            np.array([j for _, j, _ in rows], dtype=np.int64),
-            np.array([pose.T_i_j for _, _, pose in rows]).reshape(-1, 4, 4),
-            np.linalg.inv(np.array([pose.covariance for _, _, pose in rows]).reshape(-1, 6, 6)),
+            np.array(first, dtype=np.int64),
+            np.array(second, dtype=np.int64),
+            np.array([pose.T_i_j for pose in poses]).reshape(-1, 4, 4),
+            np.linalg.inv(covariance),
         )
 
 
@@ -298,7 +302,12 @@ def _normal(
         i = edges.first
         j = edges.second
         AB = AW @ B
-        blocks += [(i, i, AW @ A), (j, j, BW @ B), (i, j, AB), (j, i, np.swapaxes(AB, 1, 2))]
+        blocks += [
+            (i, i, AW @ A),
+            (j, j, BW @ B),
+            (i, j, AB),
+            (j, i, np.swapaxes(AB, 1, 2)),
+        ]
         np.add.at(gradient, i, -np.einsum("eij,ej->ei", AW, r))
         np.add.at(gradient, j, -np.einsum("eij,ej->ei", BW, r))
     if len(up_directions.pose):

@@ -368,7 +368,8 @@ class MapSession:
             total = self._base
         else:
             total = motion.seen_by(self._T_cam_body)
-            total = total if self._base is None else self._base.then(total)
+            if self._base is not None:
+                total = self._base.then(total)
         self._newest = frame, total, T_odom_cam
         return total
 
@@ -386,7 +387,10 @@ class MapSession:
         self._dark = None
         if motion is None and self._seen is not None:
             dark = _predicted(self._seen, estimate)
-            self._dark = RelativePose(dark.T_i_j, np.diag(_BROKEN)) if is_lost else dark
+            if is_lost:
+                self._dark = RelativePose(dark.T_i_j, np.diag(_BROKEN))
+            else:
+                self._dark = dark
         if seen_now:
             self._seen_ns = frame.time_ns
             self._seen = estimate
@@ -452,14 +456,20 @@ class MapSession:
             self._hand_over(self._held.pop(0))
 
     def _add_motion(self, held: _Held, relative: Relative) -> None:
-        motion = None if held.anchor is None else relative(held.anchor, held.keyframe.frame)
+        if held.anchor is None:
+            motion = None
+        else:
+            motion = relative(held.anchor, held.keyframe.frame)
         if motion is None:
             return
         motion = motion.seen_by(self._T_cam_body)
         held.motions.append(_inflated(motion if held.base is None else held.base.then(motion)))
 
     def _hand_over(self, held: _Held) -> None:
-        keyframe = replace(held.keyframe, motion=_middle(held.motions) if held.motions else None)
+        motion = None
+        if held.motions:
+            motion = _middle(held.motions)
+        keyframe = replace(held.keyframe, motion=motion)
         result = self._executor.submit(_add, self._builder, keyframe, self._features.pop(0))
         due = held.due + HANDOVER_FRAMES - SETTLED_FRAMES
         self._waiting.append((due, keyframe.frame, result))
@@ -544,7 +554,9 @@ def _predicted(before: Estimate, after: Estimate) -> RelativePose:
 
 def _unknown(older: int, newer: int) -> RelativePose | None:
     """Return the motion between two frames where only that of a frame to itself is known."""
-    return RelativePose(np.eye(4), np.zeros((6, 6))) if older == newer else None
+    if older == newer:
+        return RelativePose(np.eye(4), np.zeros((6, 6)))
+    return None
 
 
 def _middle(motions: list[RelativePose]) -> RelativePose:

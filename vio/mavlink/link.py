@@ -56,7 +56,9 @@ class UdpLink:
             data, sender = self._socket.recvfrom(_MAX_BYTES)
         except (TimeoutError, ConnectionRefusedError):
             return b""
-        return data if sender[:2] == self._address[:2] else b""
+        if sender[:2] == self._address[:2]:
+            return data
+        return b""
 
     def close(self) -> None:
         """Close the socket."""

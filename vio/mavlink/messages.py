@@ -18,7 +18,13 @@ from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, so3_exp
 from vio.records import Estimate
 
 # a camera that looks ahead: z of it is forward, x right, y down
-_R_FRD_CAM0: FloatArray = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_R_FRD_CAM0: FloatArray = np.array(
+    [
+        [0.0, 0.0, 1.0],
+        [1.0, 0.0, 0.0],
+        [0.0, 1.0, 0.0],
+    ]
+)
 _UPPER = np.triu_indices(6)
 _MIN_HORIZONTAL = 0.1  # of a unit vector, to have a heading
 _QUALITY = {"nominal": 100, "degraded": 50, "unusable": -1}
@@ -70,7 +76,9 @@ class VehicleState:
         """Angles of the vehicle in `local`, rad: about z, then y, then x."""
         R = self.R_local_frd
         pitch = math.asin(min(1.0, max(-1.0, -R[2, 0])))
-        return math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])
+        roll = math.atan2(R[2, 1], R[2, 2])
+        yaw = math.atan2(R[1, 0], R[0, 0])
+        return roll, pitch, yaw
 
     @property
     def pose_covariance_21(self) -> list[float]:
@@ -137,7 +145,10 @@ class LocalFrame:
         if not self._is_upright:
             return np.asarray(R_world_frd.T)
         gravity = estimate.gravity_world
-        down = np.array([0.0, 0.0, -1.0]) if gravity is None else gravity / np.linalg.norm(gravity)
+        if gravity is None:
+            down = np.array([0.0, 0.0, -1.0])
+        else:
+            down = gravity / np.linalg.norm(gravity)
         forward, _, below = R_world_frd.T
         level = forward - down * (forward @ down)
         if np.linalg.norm(level) < _MIN_HORIZONTAL:  # the nose points up or down

@@ -191,7 +191,9 @@ def judge_up(force: FloatArray, R_cam0_imu: FloatArray, *, measured: bool) -> li
     """
     up = force @ R_cam0_imu.T
     down_in_image = up[:, 1] / np.maximum(np.linalg.norm(up, axis=1), 1e-9)
-    share = float(np.mean(down_in_image > _AXES.upside_down_cosine)) if len(up) else 0.0
+    share = 0.0
+    if len(up):
+        share = float(np.mean(down_in_image > _AXES.upside_down_cosine))
     if share < _AXES.upside_down_share:
         return []
     explanation = (

@@ -66,7 +66,9 @@ class ImuContradiction:
         is_off = innovation_ratio > _CONTRADICTION.min_sigmas
         self._quiet = 0 if is_off else self._quiet + 1
         if self._reported:
-            return self.end(index) if self._quiet >= _CONTRADICTION.quiet_frames else []
+            if self._quiet >= _CONTRADICTION.quiet_frames:
+                return self.end(index)
+            return []
         off = [(frame, ratio) for frame, ratio in self._ratios if ratio > _CONTRADICTION.min_sigmas]
         if len(off) < _CONTRADICTION.min_frames and self._sum < _CONTRADICTION.min_sum:
             return []
@@ -78,7 +80,10 @@ class ImuContradiction:
             "axes, units, range and mount (vio check)"
         )
         figures = {"innovation_ratio": ratio}
-        since = min(off[0][0], self._sum_since) if self._sum > 0.0 else off[0][0]
+        if self._sum > 0.0:
+            since = min(off[0][0], self._sum_since)
+        else:
+            since = off[0][0]
         return [Finding(_CODE, message, index, since, lasts=True, figures=figures)]
 
     def _add(self, index: int, ratio: float) -> None:

@@ -381,7 +381,9 @@ class RepeatReport:
         if repeated is None:
             row = self._row
             self._row = []
-            seconds = (frame.time_ns - row[0].time_ns) * S_PER_NS if row else 0.0
+            seconds = 0.0
+            if row:
+                seconds = (frame.time_ns - row[0].time_ns) * S_PER_NS
             after = f"after {len(row)} repetitions ({seconds:.2f} s)"
             return (
                 [f"frame {frame.index}: the {self._words.what} change again, {after}"]
@@ -429,7 +431,9 @@ class RepeatReport:
             if self._row
             else []
         )
-        return [*still, f"{self._total} frames {effect}"] if self._total > 1 else still
+        if self._total > 1:
+            return [*still, f"{self._total} frames {effect}"]
+        return still
 
 
 def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:

@@ -127,7 +127,10 @@ def fit_gyro(record: Record, least: int, noise_radps: float | None = None) -> Gy
     omega = record.twists[:, 3:]
     noise = noise_radps
     if noise is None:
-        noise = robust_sigma(np.diff(omega, 2, axis=0)) / np.sqrt(6) if len(omega) > 4 else np.inf
+        if len(omega) > 4:
+            noise = robust_sigma(np.diff(omega, 2, axis=0)) / np.sqrt(6)
+        else:
+            noise = np.inf
     best = _at_offset(record, _NEAR_OFFSETS_S, least, noise)
     if best is None or best.axes == 0:
         return None
@@ -136,14 +139,17 @@ def fit_gyro(record: Record, least: int, noise_radps: float | None = None) -> Gy
         best = _search_far(record, best, least, noise)
     for step in (0.01, 0.003):
         near = _at_offset(record, best.offset_s + step * np.arange(-2, 3), least, noise)
-        best = near if near is not None and near.unexplained <= best.unexplained else best
+        if near is not None and near.unexplained <= best.unexplained:
+            best = near
     return best if best.axes else None
 
 
 def _search_far(record: Record, near: GyroFit, least: int, noise: float) -> GyroFit:
     """Return the fit at a clock offset of seconds where it leaves far less than the near one."""
     far = _at_offset(record, FAR_OFFSETS_S, max(least, len(record.twists) // 2), noise)
-    return far if far is not None and far.unexplained < 0.5 * near.unexplained else near
+    if far is not None and far.unexplained < 0.5 * near.unexplained:
+        return far
+    return near
 
 
 def _at_offset(

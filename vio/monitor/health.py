@@ -195,7 +195,10 @@ class RunHealth:
             return [Finding("other-calibration", message, index, lasts=True, figures=figures)]
         # What is corrected needs no figure here: the run ends with one.
         grade = rows_grade(field.rows_rms_px)
-        size = "" if grade == "worth calibrating" else f" by {field.rows_rms_px:.2f} px (rms)"
+        if grade == "worth calibrating":
+            size = ""
+        else:
+            size = f" by {field.rows_rms_px:.2f} px (rms)"
         verdict = "" if grade == "worth calibrating" else f", {grade}"
         message = (
             f"{seen}{size} in a smooth pattern: the stereo calibration is off{verdict}; by how "
@@ -240,7 +243,10 @@ class RunHealth:
         starts = report.initialised > 0 and not self._without_features
         if report.used > 0 or starts or self._last_used is None:
             ended = self._without_features
-            away_s = 0.0 if self._last_used is None else (time_ns - self._last_used[1]) * 1e-9
+            if self._last_used is None:
+                away_s = 0.0
+            else:
+                away_s = (time_ns - self._last_used[1]) * 1e-9
             self._last_used = (index, time_ns)
             self._without_features = False
             if not ended:

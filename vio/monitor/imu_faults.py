@@ -275,5 +275,7 @@ class ImuSilence:
         length_s = (until_ns - self._times[-1]) * S_PER_NS
         if length_s <= GAP_S:
             return None
-        usual_s = float(np.median(np.diff(self._times))) * S_PER_NS if len(self._times) > 1 else 0.0
+        usual_s = 0.0
+        if len(self._times) > 1:
+            usual_s = float(np.median(np.diff(self._times))) * S_PER_NS
         return None if length_s <= GAP_STEPS * usual_s else length_s

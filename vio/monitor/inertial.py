@@ -163,7 +163,10 @@ class InertialCheck:
             return
         size = judge_size(times_ns, values[:, 3:])
         self._size_judged = True
-        self._odd_size = "" if size.finding is None else size.finding.seen
+        if size.finding is None:
+            self._odd_size = ""
+        else:
+            self._odd_size = size.finding.seen
 
     def _compare(self, observations: Observations) -> list[InertialFinding]:
         """Add a frame's features, and evaluate when there is enough motion.
@@ -223,8 +226,14 @@ class InertialCheck:
 
     def _evidence(self, size: Size, record: Record, gyro_fit: GyroFit, *, last: bool) -> Evidence:
         """Return what both sensors show beside the images."""
-        early = None if size.unit is None else fit_force(record, gyro_fit, self._T[:3, 3])
-        force = None if early is None or early.windows < MIN_WINDOWS else early
+        if size.unit is None:
+            early = None
+        else:
+            early = fit_force(record, gyro_fit, self._T[:3, 3])
+        if early is None or early.windows < MIN_WINDOWS:
+            force = None
+        else:
+            force = early
         self.axes_compared |= early is not None
         return Evidence(
             R_cam0_imu=self._T[:3, :3],
@@ -341,7 +350,10 @@ class InertialCheck:
         self.imu_at_fault = judge_size(times_ns, values[:, 3:]).finding is not None
         record = record_of(motion, times_ns, values)
         gyro_fit = fit_gyro(record, _EVALUATIONS.min_intervals_at_end)
-        turns = None if gyro_fit is None else compare_rotations(record, gyro_fit, self._T[:3, :3])
+        if gyro_fit is None:
+            turns = None
+        else:
+            turns = compare_rotations(record, gyro_fit, self._T[:3, :3])
         if gyro_fit is None or turns is None:
             return
         offset = judge_offset(gyro_fit, record, _EVALUATIONS.min_intervals_at_end)

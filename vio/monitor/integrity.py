@@ -226,7 +226,9 @@ class IntegrityMonitor:
     def _onset_ns(self, finding: Finding, now_ns: int) -> int:
         """The time of the first frame that a finding holds for."""
         first = finding.first_frame
-        return now_ns if first is None else self._times.get(first, now_ns)
+        if first is None:
+            return now_ns
+        return self._times.get(first, now_ns)
 
     def _update(self, index: int, now_ns: int) -> None:
         """Take the new findings, and let go of those that have ended."""
@@ -265,7 +267,9 @@ class IntegrityMonitor:
 
 def _scale_doubt(level: int) -> float:
     """The doubt of the scale at which a level begins; 0 for none."""
-    return 0.0 if level == 0 else _MIN_SCALE_DOUBT * _SCALE_DOUBT_GROWS ** (level - 1)
+    if level == 0:
+        return 0.0
+    return _MIN_SCALE_DOUBT * _SCALE_DOUBT_GROWS ** (level - 1)
 
 
 def inflated(covariance: FloatArray, sigma_m: float) -> FloatArray:

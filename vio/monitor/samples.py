@@ -152,7 +152,10 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
         for extreme in (values[:, axis].max(), values[:, axis].min()):
             at = values[:, axis] == extreme
             # no sensor's range ends at 0: that of a simulator without noise, at rest
-            run = 0 if extreme == 0.0 else _run_at_end(values, equal, at, axis)
+            if extreme == 0.0:
+                run = 0
+            else:
+                run = _run_at_end(values, equal, at, axis)
             if run == 0:
                 continue
             name, unit = ("gyro", "rad/s") if axis < 3 else ("accelerometer", "m/s^2")
@@ -180,7 +183,9 @@ def _run_at_end(values: FloatArray, equal: BoolArray, at: BoolArray, axis: int) 
         return 0
     # Equal neighbours elsewhere are due to chance: a run of n has the probability held^(n-1).
     held = float(np.mean(equal[~(at[1:] & at[:-1]), axis]))
-    chance = np.log(_CLIPPING.min_chance) / np.log(held) if held > 0 else 0.0
+    chance = 0.0
+    if held > 0:
+        chance = np.log(_CLIPPING.min_chance) / np.log(held)
     run = _longest_run(at)
     if (
         run < max(_CLIPPING.min_run, 1 + chance)
@@ -211,7 +216,9 @@ def _has_no_noise(values: FloatArray, at: BoolArray, axis: int) -> bool:
 
 def _longest_run(mask: BoolArray) -> int:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return int((edges[1::2] - edges[::2]).max()) if len(edges) else 0
+    if not len(edges):
+        return 0
+    return int((edges[1::2] - edges[::2]).max())
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,4 +88,6 @@ def judge_turn(gyro_fit: GyroFit, R_cam0_imu: FloatArray, *, clipped: bool) -> T
     turn = turn_of_gyro(gyro_fit, R_cam0_imu)
     angle = float(np.linalg.norm(turn.rotation))
     is_turn = np.radians(_TURN.min_deg) < angle < np.radians(_TURN.max_deg)
-    return turn if is_turn and angle > _TURN.sigmas * turn.sigma else None
+    if is_turn and angle > _TURN.sigmas * turn.sigma:
+        return turn
+    return None

@@ -42,7 +42,9 @@ def quantile(values: npt.ArrayLike, share: float) -> float:
     lower = float(ordered[below])
     upper = float(ordered[below + 1])
     step = upper - lower
-    return lower + step * part if part < 0.5 else upper - step * (1 - part)
+    if part < 0.5:
+        return lower + step * part
+    return upper - step * (1 - part)
 
 
 def robust_sigma(values: npt.ArrayLike) -> float:

@@ -40,7 +40,10 @@ def write_calibration_report(folder: Path, report: CalibrationReport) -> None:
     poses = {"cam0": T_imu_cam0, "cam1": T_imu_cam0 @ se3_inverse(stereo.right[1])}
     cameras = dict(zip(("cam0", "cam1"), stereo.cameras, strict=True))
     dataset = report.source.dataset
-    times = np.zeros(0, dtype=np.int64) if dataset is None else dataset.recording.frame_times_ns
+    if dataset is None:
+        times = np.zeros(0, dtype=np.int64)
+    else:
+        times = dataset.recording.frame_times_ns
     rate_hz = median_rate_hz(times) or _USUAL_RATE_HZ
     for name, camera in cameras.items():
         if camera.lens.files.sensor_yaml is None:

@@ -142,7 +142,9 @@ def draw_check(trajectory: Trajectory, results: Sequence[MapperResult]) -> Any:
         q = (comparison.aligned[:, :3, 3] - p[0]) @ axes.T
         outside = int(((q < low) | (q > high)).any(axis=1).sum())
         q[((q < low) | (q > high)).any(axis=1)] = np.nan
-        beyond = f" ({outside} of {len(q)} outside the picture)" if outside else ""
+        beyond = ""
+        if outside:
+            beyond = f" ({outside} of {len(q)} outside the picture)"
         above.plot(*q.T, ".", color=colour, label=f"COLMAP, {result.mapper}{beyond}")
         along.plot(
             comparison.frames,

@@ -122,7 +122,8 @@ def compare_keyframes(
     Reference: Umeyama (1991) for the alignment, as in `vio.evaluation.trajectories`.
     """
     own = run.trajectory.T_world_body[rows]
-    linked = np.ones(len(rows) - 1, dtype=np.bool_) if linked is None else linked
+    if linked is None:
+        linked = np.ones(len(rows) - 1, dtype=np.bool_)
     piece, pieces = _longest_piece(own, T_other_cam0, linked)
     aligned = apply_alignment(align_poses(T_other_cam0[piece], own[piece], "se3"), T_other_cam0)
     difference_m = np.linalg.norm(aligned[:, :3, 3] - own[:, :3, 3], axis=1)
@@ -149,7 +150,9 @@ def compare_keyframes(
     if not segments and (off_m > most_m or end_deg > most_deg):
         first, last = run.frames[rows[ends]].tolist()
         segments = (Segment(first, last, off_m, end_deg),)
-    against = (None, None, None) if truth is None else _against(truth, run, rows, T_other_cam0)
+    against: tuple[float | None, float | None, float | None] = (None, None, None)
+    if truth is not None:
+        against = _against(truth, run, rows, T_other_cam0)
     return KeyframeComparison(
         total=len(rows),
         frames=run.frames[rows],
@@ -188,7 +191,9 @@ def aligned_distance_m(T_other: FloatArray, T_own: FloatArray) -> float:
     SE(3) alignment.
     """
     aligned = apply_alignment(align_poses(T_other, T_own, "se3"), T_other)
-    return float(np.sqrt(np.mean(np.sum((aligned[:, :3, 3] - T_own[:, :3, 3]) ** 2, axis=1))))
+    off = aligned[:, :3, 3] - T_own[:, :3, 3]
+    squares = np.sum(off**2, axis=1)
+    return float(np.sqrt(np.mean(squares)))
 
 
 def _scale_ratio(
@@ -206,7 +211,8 @@ def _scale_ratio(
     except EvaluationError:
         return None, None, "the camera does not move (pure rotation or standstill)"
     residual = apply_alignment(alignment, T_other)[:, :3, 3] - p
-    sigma = float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))) / (extent * np.sqrt(len(p)))
+    rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
+    sigma = rms / (extent * np.sqrt(len(p)))
     if sigma > _MOTIONS.scale_sigma:
         return (
             None,
@@ -227,10 +233,12 @@ def _disagreements(
     off_m, off_deg = motion_differences(T_own, T_other)
     bad = _stands_out(off_m, linked) | _stands_out(off_deg, linked)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int8)))
-    return tuple(
-        Segment(int(frames[a]), int(frames[b]), float(off_m[a:b].max()), float(off_deg[a:b].max()))
-        for a, b in edges.reshape(-1, 2).tolist()
-    )
+    segments = []
+    for a, b in edges.reshape(-1, 2).tolist():
+        most_m = float(off_m[a:b].max())
+        most_deg = float(off_deg[a:b].max())
+        segments.append(Segment(int(frames[a]), int(frames[b]), most_m, most_deg))
+    return tuple(segments)
 
 
 def _longest_piece(

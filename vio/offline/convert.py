@@ -139,7 +139,10 @@ def write_rectified_euroc(dataset: ImageDataset, out: Path, progress: Progress) 
     mav = out / "mav0"
     rig = rig_read_as(dataset.recording.camera, dataset.rectifier.T_rect0_imu)
     sensor = source / "imu0" / "sensor.yaml"
-    T_body_imu = read_imu_yaml(sensor)[0] if sensor.is_file() else np.eye(4)
+    if sensor.is_file():
+        T_body_imu = read_imu_yaml(sensor)[0]
+    else:
+        T_body_imu = np.eye(4)
     written = _write_images(dataset, out, "euroc", 0, None, progress)
     _check_frames(len(written.times_ns), dataset.recording)
     times = np.array(written.times_ns, dtype=np.int64)
@@ -362,7 +365,10 @@ def _poses(recording: Recording) -> list[_Pose]:
     T = recording.T_cam0_imu
     if truth is None or truth.times_ns is None:
         return []
-    poses = truth.T_world_body if T is None else truth.in_imu(T).T_world_body
+    if T is None:
+        poses = truth.T_world_body
+    else:
+        poses = truth.in_imu(T).T_world_body
     return [
         _Pose(time_ns, T_world_body)
         for time_ns, T_world_body in zip(truth.times_ns.tolist(), poses, strict=True)

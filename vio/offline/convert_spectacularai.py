@@ -71,7 +71,9 @@ def write_spectacularai(
     recording = dataset.recording
     _check_imu(recording)
     times = recording.frame_times_ns[start:stop]
-    rate_hz = NS_PER_S / float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    rate_hz = 1.0
+    if len(times) > 1:
+        rate_hz = NS_PER_S / float(np.median(np.diff(times)))
     videos = [_Video(out / name, rate_hz) for name in VIDEOS]
     lines: list[str] = []
     origin_ns: int | None = None

@@ -103,12 +103,17 @@ def _described_by(
             "what it describes"
         )
     T_cam0_imu = _extrinsics(calibration)
-    return trajectory.in_cam0(T_cam0_imu) if body == "cam0" else trajectory.in_imu(T_cam0_imu)
+    if body == "cam0":
+        return trajectory.in_cam0(T_cam0_imu)
+    return trajectory.in_imu(T_cam0_imu)
 
 
 def _extrinsics(path: Path) -> FloatArray:
     """Read `T_cam0_imu` (4, 4) of a rig, or from a file of the matrix alone."""
-    T = read_extrinsics(path) if path.name == "T_cam0_imu.txt" else load_rig(path).T_cam0_imu
+    if path.name == "T_cam0_imu.txt":
+        T = read_extrinsics(path)
+    else:
+        T = load_rig(path).T_cam0_imu
     if T is None:
         raise CalibrationError(
             f"{path}: states no pose of the IMU; give a calibration with T_cam_imu"

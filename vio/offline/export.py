@@ -116,7 +116,8 @@ def _colours_at(image: Image, uv: FloatArray) -> FloatArray:
     """
     u = np.clip(np.rint(uv[:, 0]).astype(int), 0, image.shape[1] - 1)
     v = np.clip(np.rint(uv[:, 1]).astype(int), 0, image.shape[0] - 1)
-    return np.broadcast_to(image[v, u].astype(np.float64).reshape(len(uv), -1), (len(uv), 3))
+    gray_or_colour = image[v, u].astype(np.float64).reshape(len(uv), -1)
+    return np.broadcast_to(gray_or_colour, (len(uv), 3))
 
 
 def nerfstudio_transforms(

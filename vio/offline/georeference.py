@@ -128,7 +128,10 @@ def _of_map(file: FilePath) -> Placed:
     trajectory = _trajectory_of(own)
     T = trajectory.T_world_body
     upright = sessions[0].upright
-    up = _up_of_map(T, own) if upright else -T[0, :3, 1]
+    if upright:
+        up = _up_of_map(T, own)
+    else:
+        up = -T[0, :3, 1]
     path = _path(trajectory, known, up, _UP_RAD if upright else _MOUNT_RAD)
     breaks = np.flatnonzero(np.diff([row.session for row in own])) + 1
     return Placed(file.stem, replace(path, breaks=breaks), trajectory, np.zeros((0, 3)))
@@ -203,7 +206,9 @@ def place_by_map(of: Placed, run: FilePath, file: FilePath, folder: FilePath) ->
         raise DataError(
             f"{file}: nothing says where it is on the earth; vio georeference {file} GNSS does"
         )
-    of_map = read_metrics(run)[0].get("map") if run.is_dir() else None
+    of_map = None
+    if run.is_dir():
+        of_map = read_metrics(run)[0].get("map")
     if not isinstance(of_map, dict) or not of_map.get("joined"):
         raise DataError(
             f"{run}: is no run that found its place in a map; vio localise RECORDING --map {file} "

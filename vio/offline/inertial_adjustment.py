@@ -244,7 +244,8 @@ class InertialAdjustment:
         c = self.camera
         last = np.zeros(len(self.tracks.ids), dtype=np.int64)
         last[tracks.point] = np.arange(len(tracks.point))  # rows are ordered by keyframe
-        across, down = (tracks.z[last, :2] - [c.cu, c.cv]).T / [[c.fu], [c.fv]]
+        pixels = tracks.z[last, :2]
+        across, down = (pixels - [c.cu, c.cv]).T / [[c.fu], [c.fv]]
         seconds = self.seconds[tracks.keyframe[last]]
         cells = np.stack(
             [np.arctan(across) / CELL_RAD, np.arctan(down) / CELL_RAD, seconds / _ADJUSTMENT.cell_s]
@@ -253,7 +254,9 @@ class InertialAdjustment:
 
     def _extrinsics(self, rig: FloatArray) -> tuple[FloatArray, float]:
         n = _FIELD + METRIC_TERMS + 2
-        return rig[n : n + 6] * self.prior.extrinsics, float(rig[n + 6] * self.prior.time_s)
+        extrinsics = rig[n : n + 6] * self.prior.extrinsics
+        delay_s = float(rig[n + 6] * self.prior.time_s)
+        return extrinsics, delay_s
 
     def _pixels(self, at: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Residuals (R, 3) of [ul vl ur], points in the camera (R, 3), and residuals by the
@@ -262,7 +265,8 @@ class InertialAdjustment:
         tracks = self.tracks
         prior = self.prior
         T = se3_inverse(self.cameras(at))[tracks.keyframe]
-        q = np.einsum("rij,rj->ri", T[:, :3, :3], at.p_world[tracks.point]) + T[:, :3, 3]
+        p_world = at.p_world[tracks.point]
+        q = np.einsum("rij,rj->ri", T[:, :3, :3], p_world) + T[:, :3, 3]
         q = np.where((q[:, 2] > MIN_DEPTH_M)[:, None], q, [0.0, 0.0, MIN_DEPTH_M])
         # Where points are expected: at noisy pixels, a longer baseline would pass for less noise.
         expected = project(self.camera, q)
@@ -350,7 +354,9 @@ class InertialAdjustment:
         S = np.zeros((F, 9, _SHARED))
         S[:, 3:6, -1] = -self.prior.accel_scale * steps.v
         S[:, 6:, -1] = -self.prior.accel_scale * steps.p
-        imu = _blocks(n, n, W @ A, F, K) + _blocks(n, n + 1, W @ B, F, K)
+        to_first = _blocks(n, n, W @ A, F, K)
+        to_second = _blocks(n, n + 1, W @ B, F, K)
+        imu = to_first + to_second
         parts = [hstack([imu, csr_matrix((W @ S).reshape(9 * F, _SHARED))])]
         errors = [np.einsum("fij,fj->fi", W, r).ravel()]
         walk = np.zeros((F, 6, _ADJUSTMENT.own))
@@ -499,7 +505,9 @@ def _sums(groups: IntArray, values: FloatArray, count: int) -> FloatArray:
 
 def _product(a: FloatArray, b: FloatArray) -> FloatArray:
     """Sum of a^T b over all rows (..., n)."""
-    return np.asarray(a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1]))
+    flat_a = a.reshape(-1, a.shape[-1])
+    flat_b = b.reshape(-1, b.shape[-1])
+    return np.asarray(flat_a.T @ flat_b)
 
 
 def _diagonal(blocks: FloatArray) -> bsr_matrix:

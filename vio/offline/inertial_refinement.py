@@ -98,7 +98,10 @@ def adjust_with_imu(
     tracks = build_tracks(path, keyframes, T)
     here = run.known[keyframes]
     last = run.known[-1]
-    T_cam0_imu = last["T_cam0_imu"] if np.isfinite(last["T_cam0_imu"]).all() else run.T_cam0_imu
+    if np.isfinite(last["T_cam0_imu"]).all():
+        T_cam0_imu = last["T_cam0_imu"]
+    else:
+        T_cam0_imu = run.T_cam0_imu
     late_s = float(np.nan_to_num(last["time_offset_s"]))
     T_world_imu = T @ T_cam0_imu
     # The map may have turned the world.

@@ -101,7 +101,8 @@ def after_motion(T: FloatArray, step_m: float, turn_deg: float) -> list[int]:
     for k in range(1, len(T)):
         last = T[chosen[-1]]
         moved = float(np.linalg.norm(T[k, :3, 3] - last[:3, 3]))
-        if moved >= step_m or float(rotation_angle_deg(last[:3, :3].T @ T[k, :3, :3])) >= turn_deg:
+        turned = float(rotation_angle_deg(last[:3, :3].T @ T[k, :3, :3]))
+        if moved >= step_m or turned >= turn_deg:
             chosen.append(k)
     return chosen
 

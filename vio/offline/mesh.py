@@ -123,7 +123,10 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
         after_motion(T, _DEPTHS.step_share * depth_m, _DEPTHS.step_deg), dtype=np.int64
     )
     up_odom = up_of_odometry(folder, metrics)
-    up = None if up_odom is None else up_in(T, T_odom, up_odom)
+    if up_odom is None:
+        up = None
+    else:
+        up = up_in(T, T_odom, up_odom)
     poses = "map" if mapped or map_file is not None else "odometry"
     return MeshSource(images, T[chosen], trajectory.frame_indices[chosen], poses, up, voxel_m)
 

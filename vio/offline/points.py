@@ -140,7 +140,8 @@ def reprojection(
 
 def _in_camera(T_cam0_world: FloatArray, tracks: PointTracks) -> tuple[FloatArray, BoolArray]:
     T = T_cam0_world[tracks.keyframe]
-    q = np.einsum("nij,nj->ni", T[:, :3, :3], tracks.p_world[tracks.point]) + T[:, :3, 3]
+    p_world = tracks.p_world[tracks.point]
+    q = np.einsum("nij,nj->ni", T[:, :3, :3], p_world) + T[:, :3, 3]
     ahead = q[:, 2] > MIN_DEPTH_M
     return np.where(ahead[:, None], q, [0.0, 0.0, 1.0]), ahead
 

@@ -271,7 +271,10 @@ def _panels(
         axes.plot(*path.T, color="#1f5fbf", lw=1.4, label="estimate")
         axes.plot(*path[0], "o", color="#111111", mfc="white", ms=5, label="start")
         drawn.append(path)
-        ate = "" if score is None else f", ATE {score.ate_m.rmse:.1f} m"
+        if score is None:
+            ate = ""
+        else:
+            ate = f", ATE {score.ate_m.rmse:.1f} m"
         ours = "ours: " if name == _OURS else ""
         axes.set_title(f"{ours}{name}{ate}", fontsize=10)
         axes.set_xlabel("m")

@@ -61,7 +61,10 @@ class RunImages:
             if correct is None:
                 yield frame
             elif frame.right is None:
-                depth = None if frame.depth is None else correct.depth(frame.depth)
+                if frame.depth is None:
+                    depth = None
+                else:
+                    depth = correct.depth(frame.depth)
                 yield replace(frame, left=correct.left(frame.left), depth=depth)
             else:
                 left, right = correct(frame.left, frame.right)
@@ -69,7 +72,10 @@ class RunImages:
 
     def _opened(self, source: str | None) -> Dataset:
         file = self.where / RunFile.CONFIG
-        settings = load_config(file).dataset if file.is_file() else DatasetSettings()
+        if file.is_file():
+            settings = load_config(file).dataset
+        else:
+            settings = DatasetSettings()
         settings = replace(
             settings, projection=self.seen.projection, max_frame_rate=None, camera="both"
         )
@@ -118,7 +124,9 @@ def _spans(dataset: Dataset, indices: list[int]) -> list[tuple[int, int]]:
     """Return which frames, each from one on to before another, are read to get some of them."""
     if isinstance(dataset, ImageDataset):
         return [(k, k + 1) for k in indices]
-    return [(indices[0], indices[-1] + 1)] if indices else []
+    if not indices:
+        return []
+    return [(indices[0], indices[-1] + 1)]
 
 
 def _chosen(dataset: Dataset, indices: list[int], repair: Repair) -> Iterator[StereoFrame]:
@@ -157,7 +165,10 @@ def run_images(folder: Path, metrics: dict[str, Any]) -> RunImages:
         ) from error
     if metrics["kind"] == "log":
         source = original_source(Path(metrics["source"]))
-    coefficients = None if seen.kind == "rgbd" else field_coefficients(folder, seen, metrics)
+    if seen.kind == "rgbd":
+        coefficients = None
+    else:
+        coefficients = field_coefficients(folder, seen, metrics)
     field = (
         None if coefficients is None or seen.is_cylinder else DisplacementField(seen, coefficients)
     )

@@ -382,7 +382,8 @@ def _residuals(
     """
     tracks = piece.tracks
     T = se3_inverse(piece.T_world_cam0)[piece.tracks.keyframe]
-    q = np.einsum("nij,nj->ni", T[:, :3, :3], tracks.p_world[tracks.point]) + T[:, :3, 3]
+    p_world = tracks.p_world[tracks.point]
+    q = np.einsum("nij,nj->ni", T[:, :3, :3], p_world) + T[:, :3, 3]
     q = np.where((q[:, 2] > MIN_DEPTH_M)[:, None], q, [0.0, 0.0, 1e3])
     r = tracks.z - project_off(camera, x, q)
     measured = np.repeat(tracks.has_right[:, None], 4, axis=1)
@@ -394,7 +395,9 @@ def _residuals(
 def _without_outliers(camera: StereoCamera, x: FloatArray, piece: Segment, sigma: float) -> Segment:
     r, _, _ = _residuals(camera, x, piece)
     kept = keep_rows(piece.tracks, np.abs(r).max(axis=1) < _REFINEMENT.gate_sigmas * sigma)
-    return replace(piece, tracks=kept) if len(kept.ids) else piece
+    if len(kept.ids):
+        return replace(piece, tracks=kept)
+    return piece
 
 
 @dataclass(frozen=True, slots=True)
@@ -462,7 +465,8 @@ def _normal_equations(
     gradient = np.zeros((M, K, 6))
     gradient[tracks.point, tracks.keyframe] = (r[:, None] @ J_pose)[:, 0]
     g_c[:, : 6 * K] = gradient.reshape(M, 6 * K)
-    g_c[:, 6 * K :] = _sums((r[:, None] @ J_x)[:, 0], tracks.point, M)
+    g_x = (r[:, None] @ J_x)[:, 0]
+    g_c[:, 6 * K :] = _sums(g_x, tracks.point, M)
     H_pp += _REFINEMENT.rounding * np.trace(H_pp, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     H_pp[:, range(3), range(3)] *= 1 + damping
     H_cc[range(6 * K), range(6 * K)] *= 1 + damping
@@ -527,13 +531,22 @@ def _lens_derivatives(
     of_t2 = np.stack([r2 + 2 * a * a, 2 * ab])
     bent = np.stack([a, b]) * (1 + k * r2) + t1 * of_t1 + t2 * of_t2
     mixed = 2 * (k * ab + t1 * a + t2 * b)
-    by_a = np.stack([1 + k * (r2 + 2 * a * a) + 2 * t1 * b + 6 * t2 * a, mixed])
-    by_b = np.stack([mixed, 1 + k * (r2 + 2 * b * b) + 6 * t1 * b + 2 * t2 * a])
-    by_p = np.stack([by_a, by_b, -a * by_a - b * by_b], axis=-1) / p[:, 2:]  # (2, R, 3)
+    radial_a = 1 + k * (r2 + 2 * a * a)
+    radial_b = 1 + k * (r2 + 2 * b * b)
+    a_D_a = radial_a + 2 * t1 * b + 6 * t2 * a
+    b_D_b = radial_b + 6 * t1 * b + 2 * t2 * a
+    by_a = np.stack([a_D_a, mixed])
+    by_b = np.stack([mixed, b_D_b])
+    by_z = -a * by_a - b * by_b
+    by_p = np.stack([by_a, by_b, by_z], axis=-1) / p[:, 2:]  # (2, R, 3)
     given = np.array([camera.fu, camera.fv])
     scale = (given * (1 + np.array(focal)))[:, None]
     J = np.zeros((len(p), 2, len(NAMES)))
-    for name, columns in (("k", np.stack([a, b]) * r2), ("q1", of_t1), ("q2", of_t2)):
+    for name, columns in (
+        ("k", np.stack([a, b]) * r2),
+        ("q1", of_t1),
+        ("q2", of_t2),
+    ):
         J[:, :, NAMES.index(name)] = (scale * columns).T
     J[:, :, NAMES.index("focal")] = (given[:, None] * bent).T
     J[:, 1, NAMES.index("aspect")] = given[1] * bent[1]
@@ -559,11 +572,14 @@ def _reduced_blocks(J_pose: FloatArray, J_x: FloatArray, keyframe: IntArray, K: 
 def _regions(camera: StereoCamera, tracks: PointTracks) -> IntArray:
     """Return the region of the image (M,) in which each point lies on average."""
     count = np.bincount(tracks.point, minlength=len(tracks.ids))
-    u, v = (np.bincount(tracks.point, tracks.z[:, k], len(tracks.ids)) / count for k in (0, 1))
+    points = len(tracks.ids)
+    u, v = (np.bincount(tracks.point, tracks.z[:, k], points) / count for k in (0, 1))
     width = camera.width or float(u.max()) + 1
     height = camera.height or float(v.max()) + 1
-    column = np.clip(_REFINEMENT.cells[0] * u / width, 0, _REFINEMENT.cells[0] - 1).astype(np.int64)
-    row = np.clip(_REFINEMENT.cells[1] * v / height, 0, _REFINEMENT.cells[1] - 1).astype(np.int64)
+    columns = _REFINEMENT.cells[0]
+    column = np.clip(columns * u / width, 0, columns - 1).astype(np.int64)
+    rows = _REFINEMENT.cells[1]
+    row = np.clip(rows * v / height, 0, rows - 1).astype(np.int64)
     return np.asarray(_REFINEMENT.cells[0] * row + column, dtype=np.int64)
 
 
@@ -610,17 +626,20 @@ def _eliminated(
     regions = _sums(scores, region, int(region.max()) + 1)
     poses = np.arange(6, C - X)
     params = np.arange(C - X, C)
-    S_pp = S[np.ix_(poses, poses)] + 1e-9 * np.eye(len(poses)) * np.trace(
-        S[np.ix_(poses, poses)]
-    ) / max(len(poses), 1)
+    S_poses = S[np.ix_(poses, poses)]
+    damping = 1e-9 * np.eye(len(poses)) * np.trace(S_poses) / max(len(poses), 1)
+    S_pp = S_poses + damping
     gain = np.linalg.solve(S_pp, S[np.ix_(poses, params)])
     g = scores.sum(axis=0)
     kept: BoolArray = np.bincount(region, minlength=len(regions)) > 0
+    S_cp = S[np.ix_(params, poses)]
+    of_regions = regions[:, params] - regions[:, poses] @ gain
+    information = _sums(rows.information(H_pp, gain), region, len(regions))
     return _Normal(
-        A=S[np.ix_(params, params)] - S[np.ix_(params, poses)] @ gain,
+        A=S[np.ix_(params, params)] - S_cp @ gain,
         b=g[params] - gain.T @ g[poses],
-        scores=(regions[:, params] - regions[:, poses] @ gain)[kept],
-        information=_sums(rows.information(H_pp, gain), region, len(regions))[kept],
+        scores=of_regions[kept],
+        information=information[kept],
         dp=(
             np.asarray(own.ravel(), dtype=np.float64),
             np.asarray(by_c.reshape(3 * M, C)[:, 6:], dtype=np.float64),

@@ -78,10 +78,15 @@ class CalibrationSource:
         """Return width and height in pixels; where unknown, the extent of rectified pixels (N,
         4).
         """
-        camera = None if self.dataset is None else self.dataset.recording.camera
+        if self.dataset is None:
+            camera = None
+        else:
+            camera = self.dataset.recording.camera
         if camera is not None and camera.width is not None and camera.height is not None:
             return float(camera.width), float(camera.height)
-        return (float(z[:, 0].max()) + 1, float(z[:, 1].max()) + 1) if len(z) else (1.0, 1.0)
+        if len(z):
+            return (float(z[:, 0].max()) + 1, float(z[:, 1].max()) + 1)
+        return (1.0, 1.0)
 
 
 def open_source(text: str, calibration: Path | None = None) -> CalibrationSource:
@@ -118,7 +123,10 @@ def _raw_euroc(path: Path, rejection: str) -> CalibrationSource | None:
 
     None: another format.
     """
-    mav = path / "mav0" if (path / "mav0").is_dir() else path
+    if (path / "mav0").is_dir():
+        mav = path / "mav0"
+    else:
+        mav = path
     if not all(
         (mav / name / "sensor.yaml").is_file() and (mav / name / "data").is_dir()
         for name in ("cam0", "cam1")

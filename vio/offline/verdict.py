@@ -174,7 +174,9 @@ def _size(comparison: KeyframeComparison, segments: Sequence[Segment]) -> str:
     by = max((s.difference_m for s in segments), default=0.0)
     turned = max((s.difference_deg for s in segments), default=0.0)
     text = f"{_metres(by)} ({_per_100_m(comparison, segments):.2g} m per 100 m)"
-    return text if turned < _TURNS.named_deg else f"{text} and {turned:.3g} deg"
+    if turned < _TURNS.named_deg:
+        return text
+    return f"{text} and {turned:.3g} deg"
 
 
 def _shared(first: KeyframeComparison, second: KeyframeComparison) -> list[Segment]:
@@ -206,7 +208,9 @@ def _ranges(segments: Sequence[Segment]) -> str:
 
 
 def _metres(value: float) -> str:
-    return f"{1e3 * value:.3g} mm" if value < 0.1 else f"{value:.3g} m"
+    if value < 0.1:
+        return f"{1e3 * value:.3g} mm"
+    return f"{value:.3g} m"
 
 
 def _longer(scale: float) -> str:

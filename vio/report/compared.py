@@ -92,4 +92,6 @@ def _change(first: float | None, value: float | None) -> str:
     if not first or value is None or value == first:
         return ""
     percent = 100 * (value / first - 1)
-    return " (the same)" if abs(percent) < _SAME_PERCENT else f" ({percent:+.0f} %)"
+    if abs(percent) < _SAME_PERCENT:
+        return " (the same)"
+    return f" ({percent:+.0f} %)"

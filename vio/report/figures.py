@@ -95,7 +95,10 @@ def _paths(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSecti
             )
         for run, curve, colour in zip(runs, curves, COLOURS, strict=False):
             if curve.dead_reckoning is not None:
-                label = "dead reckoning" if len(runs) == 1 else f"{run.name}, dead reckoning"
+                if len(runs) == 1:
+                    label = "dead reckoning"
+                else:
+                    label = f"{run.name}, dead reckoning"
                 _line(
                     figure,
                     curve.dead_reckoning[:, (first, second)],
@@ -178,7 +181,10 @@ def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Repor
     for truth in _truths(curves):
         _line(figure, truth.position[:, :2], "ground truth", _TRUTH, 1, 1, width=3)
     for run, mapped, colour in chosen:
-        name = "" if len(chosen) == 1 else f"{run.name}, "
+        if len(chosen) == 1:
+            name = ""
+        else:
+            name = f"{run.name}, "
         marks = {"size": 5, "symbol": "circle-open"}
         _line(
             figure,
@@ -317,7 +323,10 @@ def _features(runs: Sequence[FinishedRun]) -> ReportSection:
     for run, colour in zip(runs, COLOURS, strict=False):
         for name, dash in (("selected", "dash"), ("matched", "dot"), ("used", "solid")):
             words = FEATURE_WORDS[name]
-            label = words if len(runs) == 1 else f"{run.name}, {words}"
+            if len(runs) == 1:
+                label = words
+            else:
+                label = f"{run.name}, {words}"
             shade = (
                 colour
                 if len(runs) > 1
@@ -395,7 +404,10 @@ def _biases(runs: Sequence[FinishedRun]) -> list[ReportSection]:
 
 
 def _timing(runs: Sequence[FinishedRun]) -> ReportSection:
-    figure = _subplots(len(runs), 1, titles=[run.name for run in runs] if len(runs) > 1 else ())
+    titles: Sequence[str] = ()
+    if len(runs) > 1:
+        titles = [run.name for run in runs]
+    figure = _subplots(len(runs), 1, titles=titles)
     for row, run in enumerate(runs, start=1):
         for stage, shade in zip(STAGES, STAGE_COLOURS, strict=True):
             seconds, median = binned(run.seconds, np.nan_to_num(run.frames[f"{stage}_ms"]), 600)
@@ -441,13 +453,16 @@ def _subplots(
 ) -> go.Figure:
     from plotly.subplots import make_subplots
 
+    vertical_spacing = None
+    if rows > 1:
+        vertical_spacing = 0.25 / rows**1.5
     figure = make_subplots(
         rows=rows,
         cols=columns,
         subplot_titles=list(titles) or None,
         specs=[[{"type": kind}] * columns] * rows,
         shared_xaxes="all" if shared else False,
-        vertical_spacing=0.25 / rows**1.5 if rows > 1 else None,
+        vertical_spacing=vertical_spacing,
         horizontal_spacing=0.09,
     )
     figure.update_layout(

@@ -53,7 +53,9 @@ def _words(runs: Sequence[FinishedRun]) -> str:
     for run, colour in zip(runs, [*COLOURS, *COLOURS], strict=False):
         head = f'<h2><span class="swatch" style="background:{colour}"></span>{text(run.name)}</h2>'
         command = run.metrics.get("command")
-        typed = f"<p><code>{text(str(command))}</code></p>" if command else ""
+        typed = ""
+        if command:
+            typed = f"<p><code>{text(str(command))}</code></p>"
         said = f"<p>{text(' '.join(summary(run)))}</p>"
         paragraphs.append((head if len(runs) > 1 else "<h2>Summary</h2>") + said + typed)
     return f"<section>{''.join(paragraphs)}</section>"
@@ -80,7 +82,9 @@ def _pictures(runs: Sequence[FinishedRun], name: Path, kind: str) -> str:
     shown = []
     for run in runs:
         if (file := run.folder / name).is_file():
-            head = f"<p>{text(run.name)}</p>" if len(runs) > 1 else ""
+            head = ""
+            if len(runs) > 1:
+                head = f"<p>{text(run.name)}</p>"
             shown.append(head + image(read_input(file), kind, name.stem))
     return "".join(shown)
 
@@ -93,7 +97,9 @@ def _lists(title: str, runs: Sequence[FinishedRun], lines: Sequence[Sequence[str
         for run, found in zip(runs, lines, strict=True)
         if found
     ]
-    return f"<section><h2>{title}</h2>{''.join(lists)}</section>" if lists else ""
+    if not lists:
+        return ""
+    return f"<section><h2>{title}</h2>{''.join(lists)}</section>"
 
 
 def _key_figures(runs: Sequence[FinishedRun]) -> str:
@@ -146,5 +152,7 @@ def _figure(section: ReportSection, number: int) -> str:
         div_id=f"figure-{number}",
         config={"displaylogo": False, "responsive": True},
     )
-    remark = f'<p class="remark">{text(section.remark)}</p>' if section.remark else ""
+    remark = ""
+    if section.remark:
+        remark = f'<p class="remark">{text(section.remark)}</p>'
     return f"<section><h2>{text(section.title)}</h2>{remark}{drawing}</section>"

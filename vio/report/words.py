@@ -25,7 +25,10 @@ def summary(run: FinishedRun) -> list[str]:
     span_s = float(run.seconds[-1])
     frames = len(run.estimates)
     span = m.get("last_frame", 0) - m.get("first_frame", 0) + 1
-    counted = f"{frames} of {span}" if span > frames else str(frames)
+    if span > frames:
+        counted = f"{frames} of {span}"
+    else:
+        counted = str(frames)
     source = str(m.get("source", "")).replace("\\", "/").rstrip("/").rpartition("/")[2]
     lines = [
         f"{counted} frames of {source or 'a recording'} ({m.get('kind', 'unknown kind')}), "

@@ -85,11 +85,16 @@ def _struct(kind: str) -> Any:
 
 
 def _field(field: Field) -> Any:
-    of = _struct(field.kind) if "/" in field.kind else _BASE[field.kind]
+    if "/" in field.kind:
+        of = _struct(field.kind)
+    else:
+        of = _BASE[field.kind]
     if field.many == "array":
         return _ARRAY[of, field.length]
     if field.many == "sequence":
-        return _SEQUENCE[of, field.length] if field.length else _SEQUENCE[of]
+        if field.length:
+            return _SEQUENCE[of, field.length]
+        return _SEQUENCE[of]
     return of
 
 
@@ -118,7 +123,9 @@ def _qos(quality: Quality, *, of_images: bool = False) -> Qos:
             format_of_ros,
         )
     if quality == "reliable":
-        limits = [Policy.ResourceLimits(max_samples=_QUEUE.max_images)] if of_images else []
+        limits = []
+        if of_images:
+            limits = [Policy.ResourceLimits(max_samples=_QUEUE.max_images)]
         return Qos(reliable, Policy.History.KeepAll, format_of_ros, *limits)
     return Qos(
         reliable, Policy.Durability.TransientLocal, Policy.History.KeepLast(1), format_of_ros
@@ -129,7 +136,10 @@ class DdsTransport:
     """A participant of a DDS domain, see `Transport`."""
 
     def __init__(self, domain: int | None) -> None:
-        number = int(os.environ.get("ROS_DOMAIN_ID", "0") or 0) if domain is None else domain
+        if domain is None:
+            number = int(os.environ.get("ROS_DOMAIN_ID", "0") or 0)
+        else:
+            number = domain
         try:
             self._participant = DomainParticipant(number)
         except DDSException as error:

@@ -76,7 +76,10 @@ def run_node(
         )
     outputs: Outputs | None = None
     others = contextlib.ExitStack()
-    folder = None if settings.kept is None else LiveFolder(settings.kept, config, found)
+    if settings.kept is None:
+        folder = None
+    else:
+        folder = LiveFolder(settings.kept, config, found)
     odometry = LiveOdometry(
         found, config, drop=settings.drop, map=settings.map, copy_images=False, sink=folder
     )

@@ -60,7 +60,10 @@ def play(
     """
     recording = dataset.recording
     imu = _topic_of_imu(recording, topics)
-    cameras = topics.cameras if recording.camera.kind == "stereo" else topics.cameras[:1]
+    if recording.camera.kind == "stereo":
+        cameras = topics.cameras
+    else:
+        cameras = topics.cameras[:1]
     sensors = dict.fromkeys(cameras, IMAGE)
     if imu is not None:
         sensors[imu] = IMU

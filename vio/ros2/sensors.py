@@ -57,7 +57,9 @@ class SensorTopics:
     @property
     def cameras(self) -> tuple[str, ...]:
         """The image topics."""
-        return (self.left,) if self.right is None else (self.left, self.right)
+        if self.right is None:
+            return (self.left,)
+        return (self.left, self.right)
 
     @property
     def kinds(self) -> dict[str, str]:
@@ -65,7 +67,9 @@ class SensorTopics:
         kinds = {
             name: COMPRESSED if name.endswith("/compressed") else IMAGE for name in self.cameras
         }
-        return kinds if self.imu is None else {**kinds, self.imu: IMU}
+        if self.imu is None:
+            return kinds
+        return {**kinds, self.imu: IMU}
 
 
 @dataclass(frozen=True, slots=True)

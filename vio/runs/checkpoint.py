@@ -171,7 +171,9 @@ def _own_hook(cls: type, name: str) -> Any:
     None: it does not.
     """
     hook = getattr(cls, name, None)
-    return hook if str(getattr(hook, "__module__", None)).split(".")[0] == _PACKAGE else None
+    if str(getattr(hook, "__module__", None)).split(".")[0] == _PACKAGE:
+        return hook
+    return None
 
 
 class _Writer:
@@ -193,7 +195,10 @@ class _Writer:
         if number is None:
             number = len(self._kept)
             self._kept.append(value)
-            self._numbers[id(value)] = -1 if isinstance(value, (tuple, frozenset)) else number
+            if isinstance(value, (tuple, frozenset)):
+                self._numbers[id(value)] = -1
+            else:
+                self._numbers[id(value)] = number
             made = self._list(value)
             self._numbers[id(value)] = number
             return made
@@ -214,7 +219,9 @@ class _Writer:
         ):
             return ["observations"]
         writes = self._WRITERS.get(kind)
-        return self._object(value, kind) if writes is None else writes(self, value)
+        if writes is None:
+            return self._object(value, kind)
+        return writes(self, value)
 
     def _sequence(self, value: Iterable[Any]) -> list[Any]:
         return [type(value).__name__, *map(self.node, value)]
@@ -256,7 +263,10 @@ class _Writer:
         self.blobs.append(value.tobytes(order))
         start = self._bytes
         self._bytes = self._bytes + value.nbytes
-        dtype = np.lib.format.dtype_to_descr(value.dtype) if value.dtype.names else value.dtype.str
+        if value.dtype.names:
+            dtype = np.lib.format.dtype_to_descr(value.dtype)
+        else:
+            dtype = value.dtype.str
         return [kind, dtype, value.shape, order, start, value.flags.writeable]
 
     def _object(self, value: Any, kind: type) -> list[Any]:
@@ -340,7 +350,11 @@ class _Reader:
     def _value(self, kind: str, parts: list[Any]) -> Any:
         if kind in ("array", "scalar", "bytes"):
             array = self._array(*parts)
-            return array if kind == "array" else array[()] if kind == "scalar" else array.tobytes()
+            if kind == "array":
+                return array
+            if kind == "scalar":
+                return array[()]
+            return array.tobytes()
         if kind in ("dataset", "observations"):
             if self._dataset is None:
                 raise ValueError("its state refers to a recording")

@@ -162,6 +162,15 @@ def draw(run: DrawnRun, view_ref: FloatArray | None, *, most: int | None = None)
     )
     R_view_cam0 = R_view_body @ run.T_cam0_body[:3, :3].T
     reckoned = run.dead_reckoning
+    dead_reckoning = None
+    if reckoned is not None:
+        dead_reckoning = transform_points(
+            T_view_world, reckoned.positions[thinned(len(reckoned), most)]
+        )
+    if run.evaluation is None or view_ref is None:
+        truth = None
+    else:
+        truth = _truth(run, run.evaluation, view_ref, most)
     return Curves(
         T_view_world=T_view_world,
         seconds=seconds[rows],
@@ -172,12 +181,8 @@ def draw(run: DrawnRun, view_ref: FloatArray | None, *, most: int | None = None)
         velocity=estimates["velocity_world"] @ R_view_world.T,
         velocity_sigma=_sigmas(rotated(R_view_world, estimates["velocity_covariance"])),
         points=transform_points(T_view_world, run.points),
-        dead_reckoning=None
-        if reckoned is None
-        else transform_points(T_view_world, reckoned.positions[thinned(len(reckoned), most)]),
-        truth=None
-        if run.evaluation is None or view_ref is None
-        else _truth(run, run.evaluation, view_ref, most),
+        dead_reckoning=dead_reckoning,
+        truth=truth,
     )
 
 

@@ -88,6 +88,12 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
     )
     reckoned = folder / RunFile.DEAD_RECKONING
     in_map = folder / RunFile.MAP_TRAJECTORY
+    dead_reckoning = None
+    if reckoned.is_file():
+        dead_reckoning = read_trajectory(reckoned)
+    mapped = None
+    if in_map.is_file():
+        mapped = read_trajectory(in_map)
     return FinishedRun(
         folder=folder,
         name=folder.resolve().name,
@@ -98,10 +104,10 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
         point_sigmas=points["sigma"].astype(np.float64),
         trajectory=trajectory,
         evaluation=_evaluation(folder, trajectory, reference, T_cam0_body),
-        dead_reckoning=read_trajectory(reckoned) if reckoned.is_file() else None,
+        dead_reckoning=dead_reckoning,
         changed=_changed_settings(folder / RunFile.CONFIG),
         T_cam0_body=T_cam0_body,
-        mapped=read_trajectory(in_map) if in_map.is_file() else None,
+        mapped=mapped,
         loops=read_loops(folder),
         map_keyframes=read_keyframes(folder),
     )
@@ -199,7 +205,9 @@ def up_of_odometry(folder: Path, metrics: dict[str, Any]) -> FloatArray | None:
         DataError: the file of the estimates is damaged.
     """
     path = folder / RunFile.ESTIMATES
-    gravity = np.array(read_estimates(path)["gravity_world"][-1]) if path.is_file() else None
+    gravity = None
+    if path.is_file():
+        gravity = np.array(read_estimates(path)["gravity_world"][-1])
     return up_of(metrics.get("motion"), gravity)
 
 
@@ -207,7 +215,10 @@ def _evaluation(
     folder: Path, trajectory: Trajectory, reference: Path | None, T_cam0_body: FloatArray
 ) -> Evaluation | None:
     """Compare with a given reference, or with the one that the run left in its folder."""
-    path = folder / RunFile.REFERENCE if reference is None else reference
+    if reference is None:
+        path = folder / RunFile.REFERENCE
+    else:
+        path = reference
     if reference is None and not path.is_file():
         return None
     try:

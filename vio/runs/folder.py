@@ -334,7 +334,8 @@ def score(
     try:
         truth = numbered_by_images(reference, result.recording.image_numbers)
         poses = result.trajectory
-        poses = poses if T_world_body is None else replace(poses, T_world_body=T_world_body)
+        if T_world_body is not None:
+            poses = replace(poses, T_world_body=T_world_body)
         own = evaluate(poses, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
         for note in own.notes:
             log.warning("%s", note)
@@ -363,7 +364,9 @@ def refused_share(used: npt.ArrayLike, gated: npt.ArrayLike) -> float | None:
     """
     kept = float(np.nansum(used))
     refused = float(np.nansum(gated))
-    return refused / (kept + refused) if kept + refused else None
+    if kept + refused:
+        return refused / (kept + refused)
+    return None
 
 
 def metrics_of(
@@ -565,7 +568,10 @@ def imu_calibration(result: RunResult) -> dict[str, Any] | None:
         kind, factor = (
             ("scale_percent", 100.0) if row == column else ("misalignment_deg", math.degrees(1.0))
         )
-        axes = "xyz"[row] if row == column else "xyz"[row] + "xyz"[column]
+        if row == column:
+            axes = "xyz"[row]
+        else:
+            axes = "xyz"[row] + "xyz"[column]
         if sigma > 0:
             own.setdefault(kind, {})[axes] = factor * value
             own.setdefault(f"{kind}_sigma", {})[axes] = factor * sigma

@@ -98,7 +98,8 @@ def _with_scale(in_map: MapKeyframes, sigma: float) -> MapKeyframes:
     """
     T = in_map.T_map_body
     xi_D_scale = np.zeros((len(T), 6))
-    xi_D_scale[:, :3] = np.einsum("kji,kj->ki", T[:, :3, :3], T[:, :3, 3] - T[:1, :3, 3])
+    from_first = T[:, :3, 3] - T[:1, :3, 3]
+    xi_D_scale[:, :3] = np.einsum("kji,kj->ki", T[:, :3, :3], from_first)
     considered = sigma**2 * xi_D_scale[:, :, None] * xi_D_scale[:, None, :]
     return replace(in_map, covariance=in_map.covariance + considered)
 
@@ -160,7 +161,9 @@ def write_loops(folder: Path, loops: Sequence[LoopEvent]) -> None:
         [[getattr(o, name) for name in _LOOP_COLUMNS] for o in loops],
     )
     known = [(n, o.matches) for n, o in enumerate(loops) if o.matches is not None]
-    of_loop = np.repeat([n for n, _ in known], [len(m) for _, m in known]).astype(np.int64)
+    indices = [n for n, _ in known]
+    counts = [len(found) for _, found in known]
+    of_loop = np.repeat(indices, counts).astype(np.int64)
     none = np.zeros((0, 4)), np.zeros(0, dtype=np.bool_)
     columns: dict[str, Any] = {
         name: np.concatenate([none[name.startswith("has")], *(getattr(m, name) for _, m in known)])
@@ -280,7 +283,11 @@ def _read_matches(path: Path) -> dict[int, LoopMatches]:
     held = read_npz(path)
     shapes = [held[name].shape for name in _MATCH_COLUMNS if name in held]
     loop = held.get("loop")
-    if loop is None or shapes != [(len(loop), 4), (len(loop), 4), (len(loop),), (len(loop),)]:
+    expected = None
+    if loop is not None:
+        count = len(loop)
+        expected = [(count, 4), (count, 4), (count,), (count,)]
+    if loop is None or shapes != expected:
         raise DataError(f"{path}: is damaged; repeat the run")
     return {
         int(n): LoopMatches(*(held[name][loop == n] for name in _MATCH_COLUMNS))

@@ -252,7 +252,9 @@ def _view(paths: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
     low = paths.min(axis=0)
     high = paths.max(axis=0)
     size = high - low + 2 * max(0.1 * float((high - low).max()), _AXES.min_margin_m)
-    half = 0.5 * np.array([max(size[0], shape * size[1]), max(size[1], size[0] / shape)])
+    width = max(size[0], shape * size[1])
+    height = max(size[1], size[0] / shape)
+    half = 0.5 * np.array([width, height])
     return 0.5 * (low + high) - half, 0.5 * (low + high) + half
 
 
@@ -313,7 +315,11 @@ def _draw_height(axes: Any, curves: Curves) -> None:
 def _draw_attitude(axes: Any, curves: Curves) -> None:
     """Draw the left camera's heading, pitch and roll."""
     for k, (name, colour) in enumerate(
-        (("heading", _ESTIMATE), ("pitch", _DEAD_RECKONING), ("roll", _GREEN))
+        (
+            ("heading", _ESTIMATE),
+            ("pitch", _DEAD_RECKONING),
+            ("roll", _GREEN),
+        )
     ):
         axes.plot(curves.seconds, curves.attitude[:, k], color=colour, lw=1.2, label=name)
     axes.set_ylabel("attitude (deg)")

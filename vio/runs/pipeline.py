@@ -97,7 +97,9 @@ class RunResult:
         recording = self.recording
         found = estimated_rig(self.rig, self.estimates[-1], recording.camera, str(recording.path))
         turn = self.repair.turn
-        return found if turn is None else found.with_turned(np.array(turn), self.rig)
+        if turn is None:
+            return found
+        return found.with_turned(np.array(turn), self.rig)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -290,6 +292,12 @@ def _process(what: _Run, repair: Repair) -> RunResult:
             _nothing_done(recording, processor, stopped)
         reckoned = state.dead_reckoning is not None
         session = processor.map
+        dead_reckoning = None
+        if reckoned:
+            dead_reckoning = _dead_reckoned(recorder, body)
+        mapped = None
+        if session is not None:
+            mapped = _mapped(session, recorder)
         return RunResult(
             recording=recording,
             config=config,
@@ -297,7 +305,7 @@ def _process(what: _Run, repair: Repair) -> RunResult:
             body=body,
             T_cam0_body=source.T_cam0_body,
             estimates=recorder.estimates,
-            dead_reckoning=_dead_reckoned(recorder, body) if reckoned else None,
+            dead_reckoning=dead_reckoning,
             landmarks=recorder.landmarks(processor.pipeline.backend.landmarks()),
             frames=recorder.frames,
             observations=recorder.observations,
@@ -307,7 +315,7 @@ def _process(what: _Run, repair: Repair) -> RunResult:
             stopped=stopped,
             rig=given_rig(dataset),
             repair=state.repair,
-            mapped=None if session is None else _mapped(session, recorder),
+            mapped=mapped,
             scale_doubt=recorder.scale_doubt,
         )
 
@@ -383,7 +391,10 @@ class _RunState:
     def not_taken(self, events: Iterable[Event]) -> Iterator[Event]:
         """Yield the events of a recording that is read again which were not taken before."""
         for event in events:
-            known = self.frame_ns if isinstance(event, StereoFrame) else self.sample_ns
+            if isinstance(event, StereoFrame):
+                known = self.frame_ns
+            else:
+                known = self.sample_ns
             if known is None or event.time_ns > known:
                 yield event
 
@@ -528,7 +539,10 @@ def _taken_frames(dataset: Dataset, config: Config, start: int, stop: int | None
     """
     most_hz = config.dataset.max_frame_rate
     times_ns = dataset.recording.frame_times_ns
-    indices = range(len(times_ns)) if most_hz is None else used_frames(times_ns, most_hz).tolist()
+    if most_hz is None:
+        indices = range(len(times_ns))
+    else:
+        indices = used_frames(times_ns, most_hz).tolist()
     present = (
         range(len(times_ns))
         if not isinstance(dataset, FeatureDataset)

@@ -294,7 +294,9 @@ class RunRecorder:
     @property
     def samples(self) -> Records[MotionSample] | None:
         """All motion samples; None: not kept."""
-        return Records(self._tables["samples"], sample_of) if self._keep else None
+        if not self._keep:
+            return None
+        return Records(self._tables["samples"], sample_of)
 
     def dead_reckoned(self) -> FloatArray:
         """Poses (N, 4, 4) by dead reckoning."""
@@ -459,7 +461,10 @@ class RunRecorder:
         try:
             yield
         except OSError as error:
-            where = "" if self._folder is None else f" {self._folder.path}"
+            if self._folder is None:
+                where = ""
+            else:
+                where = f" {self._folder.path}"
             raise DataError(f"cannot write{where}: {error.strerror or error}") from error
 
     def _append_texts(self, folder: Path, start: int, stop: int) -> None:
@@ -469,7 +474,10 @@ class RunRecorder:
         if self._csv_stages is None:
             self._csv_stages = sorted(self._rows.stages)
         first = start == 0
-        tum = tum_text(rows["time_ns"], rows["T_world_imu"], body=self._body if first else None)
+        body = None
+        if first:
+            body = self._body
+        tum = tum_text(rows["time_ns"], rows["T_world_imu"], body=body)
         for name, text in zip(
             _TEXTS, (tum, frames_csv(frames, self._csv_stages, header=first)), strict=True
         ):

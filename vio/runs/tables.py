@@ -91,11 +91,29 @@ FRAME = np.dtype(
 _LOGGED = tuple(field.name for field in dataclasses.fields(FrameLog))[:-1]  # as columns
 _logged = attrgetter(*_LOGGED)
 OBSERVATION = np.dtype(
-    [("id", "<i8"), ("z", "<f8", (4,)), ("has_right", "?"), ("stale", "?"), ("sigma", "<f4", (3,))]
+    [
+        ("id", "<i8"),
+        ("z", "<f8", (4,)),
+        ("has_right", "?"),
+        ("stale", "?"),
+        ("sigma", "<f4", (3,)),
+    ]
 )
 # one row a frame: its observations
-SEEN = np.dtype([("index", "<i8"), ("time_ns", "<i8"), ("count", "<i8")])
-SAMPLE = np.dtype([("time_ns", "<i8"), ("is_imu", "?"), ("values", "<f8", (6,))])
+SEEN = np.dtype(
+    [
+        ("index", "<i8"),
+        ("time_ns", "<i8"),
+        ("count", "<i8"),
+    ]
+)
+SAMPLE = np.dtype(
+    [
+        ("time_ns", "<i8"),
+        ("is_imu", "?"),
+        ("values", "<f8", (6,)),
+    ]
+)
 MAPPED = np.dtype(
     [
         ("index", "<i8"),
@@ -104,7 +122,13 @@ MAPPED = np.dtype(
         ("covariance", "<f8", (6, 6)),
     ]
 )
-POINT = np.dtype([("id", "<i8"), ("p_world", "<f8", (3,)), ("covariance", "<f8", (3, 3))])
+POINT = np.dtype(
+    [
+        ("id", "<i8"),
+        ("p_world", "<f8", (3,)),
+        ("covariance", "<f8", (3, 3)),
+    ]
+)
 
 
 def mapped_row(index: int, estimate: Estimate) -> Rows:
@@ -142,13 +166,17 @@ def estimate_of(row: np.void) -> Estimate:
     }
     scale = _array(row["stereo_scale"])
     S = _array(row["stereo_scale_covariance"])
+    if scale is None or S is None:
+        stereo_scale = None
+    else:
+        stereo_scale = StereoScaleEstimate(scale, S)
     return Estimate(
         int(row["time_ns"]),
         np.array(row["T_world_imu"]),
         np.array(row["covariance"]),
         **optional,
         stereo_field=_stereo_field(row),
-        stereo_scale=None if scale is None or S is None else StereoScaleEstimate(scale, S),
+        stereo_scale=stereo_scale,
         integrity=INTEGRITIES[int(row["integrity"])],
     )
 
@@ -203,7 +231,10 @@ def observation_rows(seen: Observations) -> Rows:
     rows["z"] = seen.z
     rows["has_right"] = seen.has_right
     rows["stale"] = seen.stale
-    rows["sigma"] = 0.0 if seen.sigma is None else seen.sigma
+    if seen.sigma is None:
+        rows["sigma"] = 0.0
+    else:
+        rows["sigma"] = seen.sigma
     return rows
 
 
@@ -249,7 +280,9 @@ def frames_csv(frames: Sequence[FrameLog], stages: Sequence[str], *, header: boo
 
 
 def _array(value: FloatArray) -> FloatArray | None:
-    return None if np.isnan(value).all() else np.array(value)
+    if np.isnan(value).all():
+        return None
+    return np.array(value)
 
 
 def _number(value: float) -> float | None:

@@ -239,7 +239,10 @@ class MotionInformation:
         """
         ids = observations.ids
         last = self._tracked
-        T_curr_prev = np.eye(4) if motion is None else motion.T_curr_prev
+        if motion is None:
+            T_curr_prev = np.eye(4)
+        else:
+            T_curr_prev = motion.T_curr_prev
         at, known = last.find(ids)
         self._survival.count(last.age, np.isin(last.ids, ids))
         age = np.ones(len(ids), dtype=np.int64)
@@ -305,10 +308,12 @@ class MotionInformation:
         ahead = depth_of(self._camera, predicted) > self._MIN_DEPTH * self._camera.baseline_m
         safe = np.where(ahead[:, None], predicted, [0.0, 0.0, 1.0])
         off = z - project(self._camera, safe)
-        r = np.stack([off[:, 0], (off[:, 1] + off[:, 3]) / np.sqrt(2), off[:, 2]], axis=1)
+        of_rows = (off[:, 1] + off[:, 3]) / np.sqrt(2)
+        r = np.stack([off[:, 0], of_rows, off[:, 2]], axis=1)
         G = motion_rows(self._camera, safe)
         # Noise of two observations: this one and the one that triangulated the point.
-        S = G @ motion.covariance @ np.swapaxes(G, 1, 2) + 2 * self._sigma**2 * np.eye(3)
+        by_motion = G @ motion.covariance @ np.swapaxes(G, 1, 2)
+        S = by_motion + 2 * self._sigma**2 * np.eye(3)
         squares = np.einsum("ni,ni->n", r, np.linalg.solve(S, r[..., None])[..., 0])
         return np.asarray(ahead / (1 + squares / self._HALF_WEIGHT_SIGMAS**2))
 
@@ -327,7 +332,8 @@ class MotionInformation:
             if step:
                 z = project(self._camera, safe)
                 weight = row_weights(n + step * right, right & self._in_image(z[:, 2], z[:, 3]))
-                weight *= (survival**step * (ahead & self._in_image(z[:, 0], z[:, 1])))[:, None]
+                seen = ahead & self._in_image(z[:, 0], z[:, 1])
+                weight *= (survival**step * seen)[:, None]
             L[valid, k] = motion_rows(self._camera, safe) * np.sqrt(weight)[..., None]
         return L / self._sigma
 

@@ -65,7 +65,11 @@ def glare(world: World, view: View, rays: CameraRays, strength: float) -> Radian
     size = (directions.shape[2] * _GLARE.grid_px, directions.shape[1] * _GLARE.grid_px)
     # Values belong to every fourth pixel; `resize` puts them at the middles of four by four.
     shift = np.array(
-        [[1, 0, -(_GLARE.grid_px - 1) / 2], [0, 1, -(_GLARE.grid_px - 1) / 2]], dtype=np.float32
+        [
+            [1, 0, -(_GLARE.grid_px - 1) / 2],
+            [0, 1, -(_GLARE.grid_px - 1) / 2],
+        ],
+        dtype=np.float32,
     )
     large = cv2.resize(strength * total, size, interpolation=cv2.INTER_LINEAR)
     out = cv2.warpAffine(large, shift, (width, height), borderMode=cv2.BORDER_REPLICATE)
@@ -120,7 +124,8 @@ def _ghosts(
     at = source[:2] / source[2]
     fade = float(np.cos(angle / _GLARE.ghost_reach_rad * np.pi / 2))
     for place, radius, level in _GLARE.ghosts:
-        from_edge = (np.hypot(x - place * at[0], y - place * at[1]) - radius) / (0.2 * radius)
+        distance = np.hypot(x - place * at[0], y - place * at[1])
+        from_edge = (distance - radius) / (0.2 * radius)
         total += (
             share * np.float32(level * fade) * np.clip(0.5 - from_edge, 0, 1).astype(np.float32)
         )

@@ -91,10 +91,13 @@ def drawn_rig(calibrated: StereoRig, sigmas: CalibrationSigmas, *, seed: int) ->
     baseline, focal, difference, *turn_deg = s.scale * rng.standard_normal(6)
     lens = s.scale * rng.standard_normal((2, 4)) * [s.cx_px, s.cy_px, s.k1, s.k2]  # left, right
     lens[1, 1:] = lens[0, 1:] + s.rows * (lens[1, 1:] - lens[0, 1:])
-    turn = np.deg2rad(turn_deg) * [s.rows * s.pitch_deg, s.yaw_deg, s.rows * s.roll_deg]
-    zoom = 1 + focal * s.focal_length + np.array([0.0, s.rows * difference * s.focal_difference])
+    sigma_deg = [s.rows * s.pitch_deg, s.yaw_deg, s.rows * s.roll_deg]
+    turn = np.deg2rad(turn_deg) * sigma_deg
+    of_right = s.rows * difference * s.focal_difference
+    zoom = 1 + focal * s.focal_length + np.array([0.0, of_right])
     T = calibrated.T_cam0_cam1
-    T_true = se3_from_parts(T[:3, :3] @ so3_exp(turn), T[:3, 3] * (1 + baseline * s.baseline))
+    longer = 1 + baseline * s.baseline
+    T_true = se3_from_parts(T[:3, :3] @ so3_exp(turn), T[:3, 3] * longer)
     pairs = zip((calibrated.cam0, calibrated.cam1), lens, zoom.tolist(), strict=True)
     cam0, cam1 = (_changed(camera, off[:2], off[2:], factor) for camera, off, factor in pairs)
     return replace(calibrated, cam0=cam0, cam1=cam1, T_imu_cam1=calibrated.T_imu_cam0 @ T_true)

@@ -165,7 +165,8 @@ def motion_at(spline: MotionSpline, times_ns: npt.ArrayLike) -> MotionState:
         d = so3_log(np.swapaxes(R_control[:, j - 1], 1, 2) @ R_control[:, j])
         A = so3_exp(b[:, j, None] * d)
         R = R @ A
-        omega = (np.swapaxes(A, 1, 2) @ omega[..., None])[..., 0] + b1[:, j, None] * d
+        turned = (np.swapaxes(A, 1, 2) @ omega[..., None])[..., 0]
+        omega = turned + b1[:, j, None] * d
     return MotionState(t, se3_from_parts(R, p), v, a, omega)
 
 
@@ -202,7 +203,8 @@ def fit_spline(
         """Distances (N,) in metres and angles (N,) in radians between spline and samples."""
         R = _attitude(R_control, first, weights)
         distance = np.linalg.norm(design @ p_control - T[:, :3, 3], axis=1)
-        return distance, np.linalg.norm(so3_log(np.swapaxes(R, 1, 2) @ T[:, :3, :3]), axis=1)
+        R_difference = np.swapaxes(R, 1, 2) @ T[:, :3, :3]
+        return distance, np.linalg.norm(so3_log(R_difference), axis=1)
 
     distance, angle = residuals()
     for _ in range(_SMOOTHING.robust_steps if robust else 0):
@@ -251,7 +253,8 @@ def _fit(
     R = T[keep, :3, :3]
     m = A.shape[1]
     curvature = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(m - 2, m))
-    normal = A.T @ A + 1e-7 * (curvature.T @ curvature) + 1e-12 * scipy.sparse.identity(m)
+    smooth = 1e-7 * (curvature.T @ curvature)
+    normal = A.T @ A + smooth + 1e-12 * scipy.sparse.identity(m)
     factor = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(normal))
     middle = p.mean(axis=0)
     p_control = factor.solve(A.T @ (p - middle)) + middle
@@ -277,7 +280,8 @@ def _attitude(R_control: FloatArray, first: IntArray, weights: FloatArray) -> Fl
     cumulative = np.cumsum(weights[:, ::-1], axis=1)[:, ::-1]
     R = R_control[first]
     for j in range(1, weights.shape[1]):
-        d = so3_log(np.swapaxes(R_control[first + j - 1], 1, 2) @ R_control[first + j])
+        before = np.swapaxes(R_control[first + j - 1], 1, 2)
+        d = so3_log(before @ R_control[first + j])
         R = R @ so3_exp(cumulative[:, j, None] * d)
     return R
 
@@ -296,7 +300,8 @@ def spline_from_waypoints(
         DataError: fewer than two waypoints, or one is not finite.
     """
     T = np.asarray(T_world_imu, dtype=np.float64)
-    times = start_ns + np.round(np.arange(len(T)) * (interval_s / S_PER_NS)).astype(np.int64)
+    since_start_ns = np.arange(len(T)) * (interval_s / S_PER_NS)
+    times = start_ns + np.round(since_start_ns).astype(np.int64)
     spline, report = fit_spline(times, T, knot_s=interval_s)
     logger.debug(
         "waypoints met within %.2g m, %.2g rad", report.position_max_m, report.rotation_max_rad
@@ -366,11 +371,15 @@ def car_loop(
     curvature = _smooth_periodic(curvature, 2.0 / step)
     heading = np.cumsum(curvature) * step
     heading *= 2 * np.pi / heading[-1]
-    xy = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1) * step, axis=0)
+    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    xy = np.cumsum(ahead * step, axis=0)
     xy -= np.linspace(0, 1, len(s))[:, None] * xy[-1]  # close the loop
     xy -= (xy.max(axis=0) + xy.min(axis=0)) / 2
     clock = np.cumsum(step / speed)
-    duration = float(clock[-1]) if duration_s is None else duration_s
+    if duration_s is None:
+        duration = float(clock[-1])
+    else:
+        duration = duration_s
     offset = float(np.interp(start_m % length, s, clock))
     t = np.arange(0.0, duration + 0.05, 0.05)
     loops, phase = np.divmod(t + offset, clock[-1])
@@ -380,9 +389,10 @@ def car_loop(
     p = np.stack(
         [*(np.interp(where, s, xy[:, i]) for i in range(2)), height_m + sway[:, 3]], axis=1
     )
-    R = so3_exp(np.stack([0 * yaw, 0 * yaw, yaw + sway[:, 2]], 1)) @ so3_exp(
-        np.stack([sway[:, 0], sway[:, 1], 0 * yaw], 1)
-    )
+    none = 0 * yaw
+    turn = np.stack([none, none, yaw + sway[:, 2]], 1)
+    tilt = np.stack([sway[:, 0], sway[:, 1], none], 1)
+    R = so3_exp(turn) @ so3_exp(tilt)
     times = start_ns + np.round(t / S_PER_NS).astype(np.int64)
     return fit_spline(times, se3_from_parts(R, p), knot_s=0.2)[0]
 
@@ -417,7 +427,8 @@ def _sway(
     for channel, size in enumerate(amplitude):
         frequency = rng.uniform(*band_hz, 8)
         phase = rng.uniform(0, 2 * np.pi, 8)
-        out[:, channel] = size / 2 * np.sin(2 * np.pi * frequency * t[:, None] + phase).sum(axis=1)
+        waves = np.sin(2 * np.pi * frequency * t[:, None] + phase)
+        out[:, channel] = size / 2 * waves.sum(axis=1)
     return out
 
 
@@ -453,15 +464,17 @@ def hand_held(
     w = 2 * np.pi / period_s
     shift = rng.uniform(0, 2 * np.pi, 3)
     angle = w * phase
-    p = np.asarray(centre, dtype=np.float64) + np.asarray(extent, dtype=np.float64) * np.stack(
-        [np.cos(angle + shift[0]), np.sin(angle + shift[0]), np.sin(1.7 * angle + shift[1])], axis=1
-    )
+    around = angle + shift[0]
+    height = np.sin(1.7 * angle + shift[1])
+    loop = np.stack([np.cos(around), np.sin(around), height], axis=1)
+    p = np.asarray(centre, dtype=np.float64) + np.asarray(extent, dtype=np.float64) * loop
     shake = _sway(phase, seed + 1, np.array([0.06, 0.06, 0.15, 0.012, 0.012, 0.012]), (0.1, 0.7))
-    yaw = angle + shift[0] + np.pi / 2 + 0.35 * np.sin(0.6 * angle + shift[2])
+    swing = 0.35 * np.sin(0.6 * angle + shift[2])
+    yaw = angle + shift[0] + np.pi / 2 + swing
     zero = np.zeros_like(t)
-    R = so3_exp(np.stack([zero, zero, yaw + shake[:, 2]], 1)) @ so3_exp(
-        np.stack([shake[:, 0], shake[:, 1], zero], 1)
-    )
+    turn = np.stack([zero, zero, yaw + shake[:, 2]], 1)
+    tilt = np.stack([shake[:, 0], shake[:, 1], zero], 1)
+    R = so3_exp(turn) @ so3_exp(tilt)
     times = start_ns + np.round(t / S_PER_NS).astype(np.int64)
     return fit_spline(times, se3_from_parts(R, p + shake[:, 3:]), knot_s=0.1)[0]
 

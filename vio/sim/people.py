@@ -86,7 +86,9 @@ def along_walks(walks: Sequence[Walk]) -> FloatArray:
         walk.start + shares * (walk.end - walk.start) + [0.0, 0.0, _PEOPLE.keep_clear_m]
         for walk in walks
     ]
-    return np.concatenate(points) if points else np.zeros((0, 3))
+    if points:
+        return np.concatenate(points)
+    return np.zeros((0, 3))
 
 
 def walking_people(walks: Sequence[Walk], *, seed: int) -> tuple[MovingBox, ...]:
@@ -125,13 +127,15 @@ def _apart(solid: Solid, points: FloatArray) -> bool:
     if T[2, 3] - half[2] > points[0, 2] + _PEOPLE.height_m:
         return True
     local = (points - T[:3, 3]) @ T[:3, :3]
-    return bool((np.abs(local[:, :2]) > half[:2] + _PEOPLE.radius_m).any(axis=1).all())
+    outside = np.abs(local[:, :2]) > half[:2] + _PEOPLE.radius_m
+    return bool(outside.any(axis=1).all())
 
 
 def _clearance(walk: Walk, times: IntArray, path: FloatArray) -> float:
     """Least distance (m) of a camera at positions (N, 3) at times (N,) from a person."""
     at = np.array([_place(walk, int(t))[0] for t in times])
-    aside = np.maximum(np.linalg.norm(path[:, :2] - at[:, :2], axis=1) - _PEOPLE.radius_m, 0.0)
+    distance_m = np.linalg.norm(path[:, :2] - at[:, :2], axis=1)
+    aside = np.maximum(distance_m - _PEOPLE.radius_m, 0.0)
     above = np.maximum(path[:, 2] - at[:, 2] - _PEOPLE.height_m, 0.0)
     return float(np.hypot(aside, above).min())
 
@@ -148,7 +152,10 @@ def _place(walk: Walk, time_ns: int) -> tuple[FloatArray, float, float]:
     forth = leg % 2 == 0
     share = min(within * walk.speed / length, 1.0)
     walking = share < 1.0
-    turned = 0.0 if walking else (within - length / walk.speed) / _PEOPLE.pause_s * np.pi
+    if walking:
+        turned = 0.0
+    else:
+        turned = (within - length / walk.speed) / _PEOPLE.pause_s * np.pi
     heading = float(np.arctan2(way[1], way[0])) + (0.0 if forth else np.pi) + turned
     return walk.start + way * (share if forth else 1 - share), heading, float(walking)
 

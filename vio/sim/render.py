@@ -131,7 +131,10 @@ def _cones(corner: FloatArray, tile: int) -> FloatArray:
             z = block.mean(axis=0) / np.linalg.norm(block.mean(axis=0))
             # Align with image rows, so that the cone is tight.
             x = block[-1] - block[0] + 1e-9 * np.array([1.0, 0, 0])
-            x = np.array([1.0, 0, 0]) - z[0] * z if abs(z[0]) < 0.9 else x - (x @ z) * z
+            if abs(z[0]) < 0.9:
+                x = np.array([1.0, 0, 0]) - z[0] * z
+            else:
+                x = x - (x @ z) * z
             x /= np.linalg.norm(x)
             y = np.cross(z, x)
             a = block @ x
@@ -141,7 +144,9 @@ def _cones(corner: FloatArray, tile: int) -> FloatArray:
                 (float((q / depth).min()), float((q / depth).max())) for q in (a, b)
             )
             slack = 1e-6
-            spans = [(p, q) for q in (b0 - slack, b1 + slack) for p in (a0 - slack, a1 + slack)]
+            across = (a0 - slack, a1 + slack)
+            down = (b0 - slack, b1 + slack)
+            spans = [(p, q) for q in down for p in across]
             out[r, c] = [p * x + q * y + z for p, q in spans]
     return out
 
@@ -181,7 +186,8 @@ def cast(surfaces: Surfaces, T_world_cam: npt.ArrayLike, rays: npt.ArrayLike) ->
     G, index = _surface_matrices(surfaces, np.asarray(T_world_cam, dtype=np.float64))
     size = surfaces.size[index]
     rows = max(1, _RENDER.max_pairs // max(1, len(index)))
-    parts = [_cast_block(G, index, size, d[i : i + rows]) for i in range(0, max(len(d), 1), rows)]
+    begins = range(0, max(len(d), 1), rows)
+    parts = [_cast_block(G, index, size, d[i : i + rows]) for i in begins]
     return Hits(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -195,14 +201,17 @@ def _cast_block(
     a = forms[:, 0]
     b = forms[:, 1]
     w = forms[:, 2]
-    inside = (w > 0) & (a >= 0) & (b >= 0) & (a <= size[:, :1] * w) & (b <= size[:, 1:] * w)
+    inside_a = (a >= 0) & (a <= size[:, :1] * w)
+    inside_b = (b >= 0) & (b <= size[:, 1:] * w)
+    inside = (w > 0) & inside_a & inside_b
     nearness = np.where(inside, w, 0.0)
     best = nearness.argmax(axis=0)
     each = np.arange(len(d))
     nearest = nearness[best, each]
     found = nearest > 0
     scale = 1 / np.where(found, nearest, 1.0)
-    coordinates = np.stack([a[best, each], b[best, each]], axis=1) * scale[:, None]
+    at_best = (best, each)
+    coordinates = np.stack([a[at_best], b[at_best]], axis=1) * scale[:, None]
     return index[best], scale, coordinates, found
 
 
@@ -308,7 +317,8 @@ def depth_map(
 def _candidates(G: FloatArray, size: FloatArray, rays: CameraRays) -> BoolArray:
     """Surfaces (R, C, K) that may be visible in each tile; exactly one where that is certain."""
     rows, columns = rays.fine.shape[:2]
-    coarse = _cull(G, size, rays.coarse.reshape(-1, 4, 3)).reshape(*rays.coarse.shape[:2], len(G))
+    blocks = rays.coarse.shape[:2]
+    coarse = _cull(G, size, rays.coarse.reshape(-1, 4, 3)).reshape(*blocks, len(G))
     out = np.zeros((rows, columns, len(G)), dtype=np.bool_)
     for r, c in np.ndindex(coarse.shape[:2]):
         chosen = np.flatnonzero(coarse[r, c])
@@ -333,7 +343,9 @@ def _cull(G: FloatArray, size: FloatArray, cones: FloatArray) -> BoolArray:
     """
     forms = np.einsum("kij,bqj->ibqk", G, cones, optimize=True)
     w = forms[2]
-    limits = (w, forms[0], forms[1], size[:, 0] * w - forms[0], size[:, 1] * w - forms[1])
+    from_right = size[:, 0] * w - forms[0]
+    from_top = size[:, 1] * w - forms[1]
+    limits = (w, forms[0], forms[1], from_right, from_top)
     possible = np.ones((len(cones), len(G)), dtype=np.bool_)
     covers = possible.copy()
     for limit in limits:
@@ -342,7 +354,10 @@ def _cull(G: FloatArray, size: FloatArray, cones: FloatArray) -> BoolArray:
     nearness = np.where(covers, w.min(axis=1), -np.inf)
     front = nearness.argmax(axis=1)
     block = np.arange(len(cones))
-    has_cover = covers[block, front] if len(G) else np.zeros(len(cones), dtype=np.bool_)
+    if len(G):
+        has_cover = covers[block, front]
+    else:
+        has_cover = np.zeros(len(cones), dtype=np.bool_)
     behind = (w <= w[block, :, front][:, :, None]).all(axis=1)
     behind[block, front] = False
     return possible & ~(behind & has_cover[:, None])
@@ -399,7 +414,10 @@ def _shown(scene: _Scene, candidates: BoolArray, rays: CameraRays, r: int) -> np
             corner = rays.corner[:, rows.start : rows.stop + 1, columns.start : columns.stop + 1]
             ids = _nearest(scene, chosen, corner.reshape(3, -1)).reshape(corner.shape[1:])
             first = ids[:-1, :-1]
-            uniform = (first == ids[1:, :-1]) & (first == ids[:-1, 1:]) & (first == ids[1:, 1:])
+            below = ids[1:, :-1]
+            beside = ids[:-1, 1:]
+            across = ids[1:, 1:]
+            uniform = (first == below) & (first == beside) & (first == across)
             out[:, columns] = np.where(uniform, first, _EDGE_MARK)
     return out
 
@@ -411,7 +429,9 @@ def _nearest(scene: _Scene, chosen: IntArray, d: npt.NDArray[np.float32]) -> npt
     a = forms[:, 0]
     b = forms[:, 1]
     w = forms[:, 2]
-    inside = (a >= 0) & (b >= 0) & (a <= limit[:, :1] * w) & (b <= limit[:, 1:] * w)
+    inside_a = (a >= 0) & (a <= limit[:, :1] * w)
+    inside_b = (b >= 0) & (b <= limit[:, 1:] * w)
+    inside = inside_a & inside_b
     nearness = np.where(inside, w, np.float32(0))
     best = nearness.argmax(axis=0)
     return np.where(nearness.max(axis=0) > 0, chosen[best], _NONE).astype(np.int16)
@@ -500,8 +520,12 @@ def _footprint(
     inverse = 1 / forms[2]
     U = forms[0] * inverse
     V = forms[1] * inverse
-    along_u = ((g_u[0] - U * g_u[2]) * inverse) ** 2 + ((g_u[1] - V * g_u[2]) * inverse) ** 2
-    along_v = ((g_v[0] - U * g_v[2]) * inverse) ** 2 + ((g_v[1] - V * g_v[2]) * inverse) ** 2
+    U_D_u = (g_u[0] - U * g_u[2]) * inverse
+    V_D_u = (g_u[1] - V * g_u[2]) * inverse
+    U_D_v = (g_v[0] - U * g_v[2]) * inverse
+    V_D_v = (g_v[1] - V * g_v[2]) * inverse
+    along_u = U_D_u**2 + V_D_u**2
+    along_v = U_D_v**2 + V_D_v**2
     return along_u, along_v
 
 
@@ -598,10 +622,13 @@ def _shade_edges(
     winner = np.full((n, len(v)), _NONE, dtype=np.int16)
     columns = {int(k): np.flatnonzero(allowed[:, k]) for k in np.flatnonzero(allowed.any(axis=0))}
     for k, mine in columns.items():
-        a, b, w = (scene.G[k] @ d[:, :, mine].reshape(3, -1)).reshape(3, n, -1)
+        own_rays = d[:, :, mine].reshape(3, -1)
+        a, b, w = (scene.G[k] @ own_rays).reshape(3, n, -1)
         limit = scene.limit[k]
         before = best[:, mine]
-        hit = (w > before) & (a >= 0) & (b >= 0) & (a <= limit[0] * w) & (b <= limit[1] * w)
+        inside_a = (a >= 0) & (a <= limit[0] * w)
+        inside_b = (b >= 0) & (b <= limit[1] * w)
+        hit = (w > before) & inside_a & inside_b
         best[:, mine] = np.where(hit, w, before)
         winner[:, mine] = np.where(hit, np.int16(k), winner[:, mine])
     values = np.full((n, len(v)), _EMPTY, dtype=np.float32)

@@ -11,10 +11,22 @@ from vio.geometry.lie import FloatArray, nearest_rotation, se3_inverse
 from vio.geometry.stereo import StereoCamera
 
 # Camera axes (right, down, forward) in a body frame with x forward, y left, z up.
-_R_CAM_FORWARD_BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+_R_CAM_FORWARD_BODY = np.array(
+    [
+        [0.0, -1.0, 0.0],
+        [0.0, 0.0, -1.0],
+        [1.0, 0.0, 0.0],
+    ]
+)
 
 # Axes of EuRoC's IMU (up, right, forward) in a body with x forward, y left, z up.
-R_FLU_EUROC_IMU = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+R_FLU_EUROC_IMU = np.array(
+    [
+        [0.0, 0.0, 1.0],
+        [0.0, -1.0, 0.0],
+        [1.0, 0.0, 0.0],
+    ]
+)
 
 
 def _forward_T_cam0_imu(cam0_in_imu: tuple[float, float, float]) -> FloatArray:
@@ -108,7 +120,11 @@ def fisheye_rig(width: int = 640, height: int = 480) -> StereoRig:
     T_imu_cam0 = se3_inverse(_forward_T_cam0_imu((0.04, 0.055, 0.01)))
     toe = 0.01
     T_cam0_cam1 = np.eye(4)
-    T_cam0_cam1[:3, :3] = [[np.cos(toe), 0, -np.sin(toe)], [0, 1, 0], [np.sin(toe), 0, np.cos(toe)]]
+    T_cam0_cam1[:3, :3] = [
+        [np.cos(toe), 0, -np.sin(toe)],
+        [0, 1, 0],
+        [np.sin(toe), 0, np.cos(toe)],
+    ]
     T_cam0_cam1[:3, 3] = [0.11, 0.001, -0.002]
     return StereoRig(cam0, cam1, T_imu_cam0, T_imu_cam0 @ T_cam0_cam1)
 
@@ -133,6 +149,9 @@ def wide_rig(width: int = 512) -> StereoRig:
     T_imu_cam0 = se3_inverse(_forward_T_cam0_imu((0.04, 0.0505, 0.01)))
     pitch = 0.0469
     T_cam1_cam0 = np.eye(4)
-    T_cam1_cam0[1:3, 1:3] = [[np.cos(pitch), -np.sin(pitch)], [np.sin(pitch), np.cos(pitch)]]
+    T_cam1_cam0[1:3, 1:3] = [
+        [np.cos(pitch), -np.sin(pitch)],
+        [np.sin(pitch), np.cos(pitch)],
+    ]
     T_cam1_cam0[:3, 3] = [-0.10092, -0.00196, -0.00147]
     return StereoRig(cam0, cam1, T_imu_cam0, T_imu_cam0 @ se3_inverse(T_cam1_cam0))

@@ -328,7 +328,10 @@ def _motion(scenario: Scenario, duration_s: float) -> MotionSpline:
         return car_loop(duration_s=duration_s, seed=scenario.seed)
     if scenario.scene in ("corridor", "doors"):
         return _walk(duration_s, scenario.seed)
-    centre = (0.0, -37.8, 1.5) if scenario.scene == "street" else (0.0, 0.0, 1.4)
+    if scenario.scene == "street":
+        centre = (0.0, -37.8, 1.5)
+    else:
+        centre = (0.0, 0.0, 1.4)
     return hand_held(centre=centre, duration_s=duration_s, seed=scenario.seed)
 
 
@@ -419,7 +422,10 @@ def _room(
         room, seed, bare_walls=walls, bare_kind=_bare_kind(hard), moving=moving, windows=windows
     )
     recorded = isinstance(scenario.trajectory, Path)
-    around = room_around(motion, seed=seed) if recorded else room(seed)
+    if recorded:
+        around = room_around(motion, seed=seed)
+    else:
+        around = room(seed)
     if not furnished:
         return inside(bounds=around.bounds, furniture=0, pictures=0)
     if not (walks or recorded):
@@ -450,8 +456,17 @@ def _boxes_along_walls(world: World, motion: MotionSpline) -> tuple[MovingBox, .
     low = world.bounds[0] + _SCENE.wall_gap_m
     high = world.bounds[1] - _SCENE.wall_gap_m
     z = (world.bounds[0, 2] + world.bounds[1, 2]) / 2
-    corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
-    lanes = [np.array([[*corners[i], z], [*corners[(i + 1) % 4], z]]) for i in range(4)]
+    corners = [
+        (low[0], low[1]),
+        (high[0], low[1]),
+        (high[0], high[1]),
+        (low[0], high[1]),
+    ]
+    lanes = []
+    for i in range(4):
+        begin = [*corners[i], z]
+        end = [*corners[(i + 1) % 4], z]
+        lanes.append(np.array([begin, end]))
     return tuple(_oscillating_box(lane, motion.start_ns, 8.0 + i) for i, lane in enumerate(lanes))
 
 
@@ -537,7 +552,9 @@ def default_workers(frames: int) -> int:
     """Default number of processes: one for short recordings, which finish before a second one
     has started.
     """
-    return min(2, os.cpu_count() or 1) if frames >= 100 else 1
+    if frames >= 100:
+        return min(2, os.cpu_count() or 1)
+    return 1
 
 
 @functools.lru_cache(maxsize=1)

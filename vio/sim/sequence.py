@@ -172,7 +172,11 @@ def simulate(
     times = _frame_times(motion, rate_hz, frame_times_ns, effects, faults)
     _check_cameras(world, true_rig, motion, times)
     taken, stamps = _apply_faults(times, faults, seed)
-    record = simulate_imu(motion, noise=imu, seed=seed) if isinstance(imu, ImuNoise) else imu
+    record: ImuRecord | None
+    if isinstance(imu, ImuNoise):
+        record = simulate_imu(motion, noise=imu, seed=seed)
+    else:
+        record = imu
     samples: Sequence[VelocitySample] = ()
     if velocity is not None:
         samples = simulate_velocity(motion, rate_hz=rate_hz, noise=velocity, seed=seed)
@@ -321,7 +325,10 @@ class SimulatedRecording:
         """
         recording = self.recording
         chosen = frame_range(recording, start, stop)
-        frames = (self.frame(k) for k in chosen) if images else blank_frames(recording, chosen)
+        if images:
+            frames = (self.frame(k) for k in chosen)
+        else:
+            frames = blank_frames(recording, chosen)
         inertial = () if self.simulation.imu is None else imu_samples(self.simulation.imu)
         return merge_events(
             recording, chosen, in_time_order(self.simulation.velocity, inertial), frames
@@ -500,7 +507,10 @@ def read_flight(
         raise DataError(
             f"no image time is within the ground truth {groundtruth}; use the same clock for both"
         )
-    imu = None if imu_csv is None else read_imu_table(imu_csv, whole_ns=True)[0]
+    if imu_csv is None:
+        imu = None
+    else:
+        imu = read_imu_table(imu_csv, whole_ns=True)[0]
     return RecordedFlight(motion, times, imu)
 
 

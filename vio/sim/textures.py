@@ -84,7 +84,10 @@ def build_mips(texture: Image) -> MipTexture:
         scale = 2.0 ** (-step / LEVELS_PER_OCTAVE)
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
         # From the level an octave up: area averaging over at least two texels each way.
-        source = levels[step - LEVELS_PER_OCTAVE] if step >= LEVELS_PER_OCTAVE else levels[0]
+        if step >= LEVELS_PER_OCTAVE:
+            source = levels[step - LEVELS_PER_OCTAVE]
+        else:
+            source = levels[0]
         levels.append(
             np.ascontiguousarray(cv2.resize(source, size, interpolation=cv2.INTER_AREA)).reshape(
                 size[::-1]
@@ -179,7 +182,9 @@ def octave_noise(
     amplitude = 1.0
     power = 0.0
     for wavelength in wavelengths:
-        shape = (int(np.ceil(height / wavelength)) + 3, int(np.ceil(width / wavelength)) + 3)
+        rows = int(np.ceil(height / wavelength)) + 3
+        columns = int(np.ceil(width / wavelength)) + 3
+        shape = (rows, columns)
         fresh = (rng.random(shape, dtype=np.float32) - 0.5) * np.float32(3.4 * amplitude)
         if noise is None:
             noise = fresh
@@ -193,7 +198,9 @@ def octave_noise(
         amplitude *= falloff
     assert noise is not None
     if wavelengths[-1] > 1.0:
-        full = (round(noise.shape[1] * wavelengths[-1]), round(noise.shape[0] * wavelengths[-1]))
+        rows, columns = noise.shape[:2]
+        longest = wavelengths[-1]
+        full = (round(columns * longest), round(rows * longest))
         noise = cv2.resize(noise, full, interpolation=cv2.INTER_CUBIC).astype(np.float32)
     return np.ascontiguousarray(noise[:height, :width]) / np.float32(np.sqrt(power))
 
@@ -206,7 +213,9 @@ def _rectangles(
     contrast: float,
 ) -> None:
     """Add axis-aligned rectangles with log-uniform sides (texels) to the canvas."""
-    size = np.exp(rng.uniform(np.log(max(side[0], 1.5)), np.log(max(side[1], 2.0)), (count, 2)))
+    log_low = np.log(max(side[0], 1.5))
+    log_high = np.log(max(side[1], 2.0))
+    size = np.exp(rng.uniform(log_low, log_high, (count, 2)))
     extent = np.array(canvas.shape[::-1])
     low = -size / 2 + rng.random((count, 2)) * (extent + size / 2)
     change = rng.uniform(-contrast, contrast, count).astype(np.float32)
@@ -223,12 +232,15 @@ def _polygons(
     contrast: float,
 ) -> None:
     """Add rotated polygons of three to five corners with smooth edges to the canvas."""
-    radius = np.exp(rng.uniform(np.log(max(side[0], 2.0)), np.log(max(side[1], 3.0)), (count, 1)))
+    log_low = np.log(max(side[0], 2.0))
+    log_high = np.log(max(side[1], 3.0))
+    radius = np.exp(rng.uniform(log_low, log_high, (count, 1)))
     angle = np.sort(rng.uniform(0, 2 * np.pi, (count, 5)), axis=1)
     reach = radius * rng.uniform(0.6, 1, (count, 5))
     extent = np.array(canvas.shape[::-1])
     centre = rng.random((count, 1, 2)) * extent
-    points = centre + reach[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    points = centre + reach[..., None] * direction
     low = np.clip(np.floor(points.min(axis=1)) - 1, 0, extent).astype(np.int64)
     high = np.clip(np.ceil(points.max(axis=1)) + 2, 0, extent).astype(np.int64)
     fixed = np.round((points - low[:, None]) * 16).astype(np.int32)
@@ -248,7 +260,11 @@ def _scatter(
     """Add marks of every size from half a metre to a centimetre, more of the smaller ones."""
     height, width = canvas.shape
     area = width * height / per_m**2
-    for low, high, weight in ((0.15, 0.5, 1.5), (0.05, 0.15, 8.0), (0.015, 0.05, 30.0)):
+    for low, high, weight in (
+        (0.15, 0.5, 1.5),
+        (0.05, 0.15, 8.0),
+        (0.015, 0.05, 30.0),
+    ):
         if high * per_m < 2.5:
             continue
         count = min(int(area * density * weight), 2 * _TEXTURE.max_marks)
@@ -377,7 +393,9 @@ def _crate(width: int, height: int, per_m: float, rng: np.random.Generator) -> _
 def _edged(canvas: _Canvas, per_m: float, rng: np.random.Generator) -> _Canvas:
     """Darken a thin rim, so that boxes are distinguishable."""
     rim = max(1, round(0.012 * per_m))
-    for edge in (canvas[:rim], canvas[-rim:], canvas[:, :rim], canvas[:, -rim:]):
+    rows = (canvas[:rim], canvas[-rim:])
+    columns = (canvas[:, :rim], canvas[:, -rim:])
+    for edge in (*rows, *columns):
         edge *= 0.45
     return canvas * np.float32(rng.uniform(0.75, 1.15))
 
@@ -434,7 +452,8 @@ def _window(
         _fill(canvas, (x + w / 2 - rim / 3, y, 2 * rim / 3, h), 190.0)
     if rng.random() < 0.7:
         _fill(canvas, (x, y + h * rng.uniform(0.3, 0.6), w, 2 * rim / 3), 190.0)
-    _fill(canvas, (x - 1.6 * rim, y + h + rim, w + 3.2 * rim, rim), rng.uniform(150, 225))
+    sill = (x - 1.6 * rim, y + h + rim, w + 3.2 * rim, rim)
+    _fill(canvas, sill, rng.uniform(150, 225))
 
 
 def _panel(
@@ -453,14 +472,21 @@ def _panel(
         return
     h, w = region.shape
     fresh = octave_noise(w, h, rng, coarsest_texels=0.5 * per_m, falloff=0.85)
-    region[:] = rng.uniform(35, 80) + 14 * fresh if dark else rng.uniform(60, 200) + 22 * fresh
+    if dark:
+        region[:] = rng.uniform(35, 80) + 14 * fresh
+    else:
+        region[:] = rng.uniform(60, 200) + 22 * fresh
     _rectangles(region, rng, 7, (0.08 * w, 0.6 * w), 45)
     _polygons(region, rng, 4, (0.04 * w, 0.25 * w), 60)
 
 
 def _region(canvas: _Canvas, box: tuple[float, float, float, float]) -> _Canvas:
     x, y, w, h = box
-    return canvas[max(0, round(y)) : max(0, round(y + h)), max(0, round(x)) : max(0, round(x + w))]
+    top = max(0, round(y))
+    bottom = max(0, round(y + h))
+    left = max(0, round(x))
+    right = max(0, round(x + w))
+    return canvas[top:bottom, left:right]
 
 
 def _fill(canvas: _Canvas, box: tuple[float, float, float, float], value: float) -> None:
@@ -538,7 +564,9 @@ def _glass(width: int, height: int, per_m: float, rng: np.random.Generator) -> _
     """A window against the light: bright panes, dark bars and frame."""
     canvas = np.full((height, width), 235.0, dtype=np.float32)
     bar = max(2, round(0.05 * per_m))
-    for edge in (canvas[:bar], canvas[-bar:], canvas[:, :bar], canvas[:, -bar:]):
+    rows = (canvas[:bar], canvas[-bar:])
+    columns = (canvas[:, :bar], canvas[:, -bar:])
+    for edge in (*rows, *columns):
         edge[:] = 12.0
     for count, along in (
         (max(2, round(width / per_m / 0.8)), width),

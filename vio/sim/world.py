@@ -308,7 +308,8 @@ def _windows(
         normal = np.zeros(3)
         up = np.array([0.0, 0.0, 1.0])
         normal[axis] = -sign
-        size = np.minimum(np.array([1.9, 1.3]) * scale, 0.6 * (box[1] - box[0])[[1 - axis, 2]])
+        wall = (box[1] - box[0])[[1 - axis, 2]]
+        size = np.minimum(np.array([1.9, 1.3]) * scale, 0.6 * wall)
         middle = box[0] + (box[1] - box[0]) * np.array(
             [*rng.uniform(0.3, 0.7, 2), rng.uniform(0.5, 0.62)]
         )
@@ -332,14 +333,20 @@ def corridor(
     right one.
     """
     length_m, width_m, height_m = _CORRIDOR_M
-    box = np.array([[0.0, -width_m / 2, 0.0], [length_m, width_m / 2, height_m]])
+    box = np.array(
+        [
+            [0.0, -width_m / 2, 0.0],
+            [length_m, width_m / 2, height_m],
+        ]
+    )
     rng = np.random.default_rng([seed, 2])
     patches = _shell(box, bare_walls, texel_m, bare_kind)
     solids: list[Solid] = []
     x = rng.uniform(2.0, 4.0)
     while x < length_m - 2:
         size = rng.uniform((0.5, 0.25, 0.6), (1.2, 0.4, 1.9))
-        solid = Solid(_pose((x, -width_m / 2 + size[1] / 2, size[2] / 2), 0.0), size / 2)
+        at_wall = -width_m / 2 + size[1] / 2
+        solid = Solid(_pose((x, at_wall, size[2] / 2), 0.0), size / 2)
         solids.append(solid)
         patches += _box_patches(solid, _OF_WOOD[rng.choice(2)], texel_m, hidden=("-z",))
         x += rng.uniform(2.0, 4.5)
@@ -360,7 +367,10 @@ def equal_doors(seed: int = 0, *, texel_m: float = 0.003) -> World:
     """
     _, width_m, height_m = _CORRIDOR_M
     box = np.array(
-        [[0.0, -width_m / 2, 0.0], [_WORLD.doors * _WORLD.door_m, width_m / 2, height_m]]
+        [
+            [0.0, -width_m / 2, 0.0],
+            [_WORLD.doors * _WORLD.door_m, width_m / 2, height_m],
+        ]
     )
     ends: dict[str, TextureKind] = {"+x": "wall", "-x": "wall"}
     centre = _pose((box[0] + box[1]) / 2, 0.0)
@@ -377,7 +387,8 @@ def equal_doors(seed: int = 0, *, texel_m: float = 0.003) -> World:
     for number in range(_WORLD.doors):
         middle = np.array([(number + 0.5) * _WORLD.door_m, 0.0, height_m / 2])
         cell = _axis_rectangles(_pose(middle, 0.0), half, kinds, texel_m, inwards=True)
-        door = Solid(_pose((middle[0], -width_m / 2 + 0.03, 1.0), 0.0), np.array([0.45, 0.03, 1.0]))
+        half_size = np.array([0.45, 0.03, 1.0])
+        door = Solid(_pose((middle[0], -width_m / 2 + 0.03, 1.0), 0.0), half_size)
         solids.append(door)
         cell += _box_patches(door, "wood", texel_m, hidden=("-z",))
         for y, along in places:
@@ -432,7 +443,12 @@ def street(
         patches += _box_patches(solid, "crate", 0.6 * texel_m, hidden=("-z",))
     reach = float(max(outer)) + 250.0
     patches += _far_box(reach)
-    bounds = np.array([[-outer[0], -outer[1], 0.0], [outer[0], outer[1], 40.0]])
+    bounds = np.array(
+        [
+            [-outer[0], -outer[1], 0.0],
+            [outer[0], outer[1], 40.0],
+        ]
+    )
     lighting = _sunlight(solids, seed) if sunlit else None
     solids.append(
         Solid(_pose((0.0, 0.0, 10.0), 0.0), np.array([inner[0] - 3.0, inner[1] - 3.0, 10.0]))
@@ -453,7 +469,8 @@ def _sunlight(casters: Sequence[Solid], seed: int) -> Lighting:
 
 def _bounds(bounds: npt.ArrayLike) -> FloatArray:
     box = np.asarray(bounds, dtype=np.float64)
-    if box.shape != (2, 3) or not np.all(np.isfinite(box)) or np.any(box[1] - box[0] < 0.5):
+    has_form = box.shape == (2, 3)
+    if not has_form or not np.all(np.isfinite(box)) or np.any(box[1] - box[0] < 0.5):
         raise SimulationError(
             "scene bounds must be a lower and an upper corner (2, 3) at least 0.5 m apart each way"
         )
@@ -516,7 +533,10 @@ def _axis_rectangles(
         axis, sign = _FACES[face]
         side = np.zeros(3)
         side[axis] = sign
-        down = np.array([0.0, -1.0, 0.0]) if axis == 2 else np.array([0.0, 0.0, -1.0])
+        if axis == 2:
+            down = np.array([0.0, -1.0, 0.0])
+        else:
+            down = np.array([0.0, 0.0, -1.0])
         across = 1 - axis if axis != 2 else 0
         size = 2 * np.array([half[across], half[1] if axis == 2 else half[2]])
         patch = _rectangle(side * half[axis], -side if inwards else side, down, size, kind, texel_m)
@@ -556,7 +576,9 @@ def _default_clear(box: FloatArray) -> FloatArray:
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     middle = (box[0] + box[1]) / 2
     half = (box[1] - box[0]) / 2
-    ring = np.stack([np.cos(angle) * half[0], np.sin(angle) * half[1], 0 * angle], axis=1)
+    along = np.cos(angle) * half[0]
+    across = np.sin(angle) * half[1]
+    ring = np.stack([along, across, 0 * angle], axis=1)
     return np.concatenate([middle + ring * radius for radius in (0.0, 0.2, 0.4, 0.55)])
 
 
@@ -591,7 +613,9 @@ def _place_furniture(
         if np.any(box[1, :2] - box[0, :2] < 2 * reach):
             continue
         xy = rng.uniform(box[0, :2] + reach, box[1, :2] - reach)
-        solid = Solid(_pose((*xy, box[0, 2] + size[2] / 2), rng.uniform(-np.pi, np.pi)), size / 2)
+        middle_z = box[0, 2] + size[2] / 2
+        yaw = rng.uniform(-np.pi, np.pi)
+        solid = Solid(_pose((*xy, middle_z), yaw), size / 2)
         if _is_clear(solid, clear, 0.6) and not _overlaps(solid, solids):
             return solid
     return None
@@ -602,8 +626,10 @@ def _stack(below: Solid, rng: np.random.Generator, scale: float) -> Solid | None
     if rng.random() < 0.5 or below.half_size[2] > 0.55 * scale:
         return None
     size = 2 * below.half_size * rng.uniform((0.4, 0.4, 0.4), (0.75, 0.75, 0.9))
-    centre = below.T_world_box[:3, 3] + np.array([0, 0, below.half_size[2] + size[2] / 2])
-    yaw = np.arctan2(below.T_world_box[1, 0], below.T_world_box[0, 0]) + rng.uniform(-0.4, 0.4)
+    above_m = below.half_size[2] + size[2] / 2
+    centre = below.T_world_box[:3, 3] + np.array([0, 0, above_m])
+    yaw_below = np.arctan2(below.T_world_box[1, 0], below.T_world_box[0, 0])
+    yaw = yaw_below + rng.uniform(-0.4, 0.4)
     return Solid(_pose(centre, yaw), size / 2)
 
 
@@ -626,7 +652,10 @@ def _hang_picture(
     centre = np.zeros(3)
     centre[along] = rng.uniform(low[along] + width / 2, high[along] - width / 2)
     centre[2] = rng.uniform(low[2] + height / 2, high[2] - height / 2)
-    centre[axis] = box[1, axis] - thick / 2 if sign > 0 else box[0, axis] + thick / 2
+    if sign > 0:
+        centre[axis] = box[1, axis] - thick / 2
+    else:
+        centre[axis] = box[0, axis] + thick / 2
     half = np.zeros(3)
     half[axis] = thick / 2
     half[along] = width / 2
@@ -718,7 +747,8 @@ def _roadside(half: FloatArray, rng: np.random.Generator) -> list[Solid]:
                 else rng.uniform((3.4, 1.6, 1.3), (5.2, 2.0, 2.4))
             )
             yaw = heading + rng.normal(0, 0.03)
-            solid = Solid(_pose((*(point + side * normal), size[2] / 2), yaw), size / 2)
+            beside = point + side * normal
+            solid = Solid(_pose((*beside, size[2] / 2), yaw), size / 2)
             if not _overlaps(solid, out):
                 out.append(solid)
                 break
@@ -729,8 +759,12 @@ def _on_rectangle(half: FloatArray, s: float) -> tuple[FloatArray, float, float]
     """Point, heading and distance to the nearest corner at arc length s along a rectangle,
     counter-clockwise.
     """
-    sides = [(np.array([-1, -1]), np.array([1, 0])), (np.array([1, -1]), np.array([0, 1]))]
-    sides += [(np.array([1, 1]), np.array([-1, 0])), (np.array([-1, 1]), np.array([0, -1]))]
+    sides = [
+        (np.array([-1, -1]), np.array([1, 0])),
+        (np.array([1, -1]), np.array([0, 1])),
+        (np.array([1, 1]), np.array([-1, 0])),
+        (np.array([-1, 1]), np.array([0, -1])),
+    ]
     for start, direction in sides:
         length = 2 * float(np.abs(direction) @ half)
         if s <= length:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+from vio.records import Image
 from vio.sources.recorder import Form, Recorded, Recorder
 from vio.sources.source import LiveSource, SourceFrame
 from vio.targets.description import Target
@@ -78,7 +79,9 @@ class _Search:
     def take(self, frame: SourceFrame) -> bool:
         """Begin with a frame where none is searched; return whether a search has ended."""
         if self._running is None:
-            images = (frame.left,) if frame.right is None else (frame.left, frame.right)
+            images: tuple[Image, ...] = (frame.left,)
+            if frame.right is not None:
+                images = (frame.left, frame.right)
             self._running = self._thread.submit(self._guidance.add_images, images)
         if not self._wait and not self._running.done():
             return False

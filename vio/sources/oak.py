@@ -156,7 +156,10 @@ class OakSource:
 
     def _imu_packets(self) -> list[Any]:
         """Return the packets of samples that have come."""
-        messages = [] if self._imu is None else self._imu.tryGetAll()
+        if self._imu is None:
+            messages = []
+        else:
+            messages = self._imu.tryGetAll()
         return [packet for message in messages for packet in message.packets]
 
     def events(self) -> Iterator[SourceEvent | None]:

@@ -19,6 +19,7 @@ import numpy as np
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.errors import DataError, MissingDependencyError, extra_text
 from vio.geometry.lie import FloatArray, se3_from_parts
+from vio.geometry.stereo import intrinsic_matrix
 from vio.live.pairing import Pairing
 from vio.numerics.kinds import Capacity
 from vio.records import Image
@@ -195,9 +196,7 @@ class RealSenseSource:
         return Rig(lenses[0], lenses[1], _transform(left.get_extrinsics_to(right)), T_cam0_imu)
 
     def _lens(self, found: Any) -> Any:
-        K = np.array(
-            [[found.fx, 0, found.ppx], [0, found.fy, found.ppy], [0, 0, 1]], dtype=np.float64
-        )
+        K = intrinsic_matrix(found.fx, found.fy, found.ppx, found.ppy)
         name = str(found.model).rpartition(".")[2]
         if name not in _MODELS:
             if not any(found.coeffs):
@@ -246,7 +245,10 @@ class RealSenseSource:
             time_ns = round(1e6 * frame.get_timestamp())
             if frame.is_motion_frame():
                 data = frame.as_motion_frame().get_motion_data()
-                take = imu.gyro if profile.stream_type() == rs.stream.gyro else imu.accel
+                if profile.stream_type() == rs.stream.gyro:
+                    take = imu.gyro
+                else:
+                    take = imu.accel
                 yield from take(time_ns, np.array([data.x, data.y, data.z]))
             else:
                 image = np.asarray(frame.as_video_frame().get_data()).copy()

@@ -73,7 +73,10 @@ class Recorder:
             atomic_write_text(folder / name, kalibr_text(rig))
             recorded = recorded or Recorded(rig.cam1 is not None, rig.T_cam0_imu is not None)
         assert recorded is not None, "a source without a rig says what it gives"
-        self._open = _plain(folder, recorded) if form == "plain" else _bag(folder, form)
+        if form == "plain":
+            self._open = _plain(folder, recorded)
+        else:
+            self._open = _bag(folder, form)
         self._events: queue.SimpleQueue[SourceEvent | None] = queue.SimpleQueue()
         self._room = threading.Semaphore(_WAITING)
         self._failure: Exception | None = None

@@ -83,7 +83,10 @@ def run_source(
             if watcher is not None:
                 watcher(result)
 
-        folder = None if kept is None else LiveFolder(kept, config, rig)
+        if kept is None:
+            folder = None
+        else:
+            folder = LiveFolder(kept, config, rig)
         odometry = LiveOdometry(
             rig,
             config,

@@ -47,7 +47,10 @@ class VideoSource:
             have = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*"))) or "none"
             raise DataError(f"{name}: there is no such device; video devices are: {have}")
         where = int(name) if name.isdigit() else name
-        self._video = cv2.VideoCapture(where, cv2.CAP_V4L2) if device else cv2.VideoCapture(where)
+        if device:
+            self._video = cv2.VideoCapture(where, cv2.CAP_V4L2)
+        else:
+            self._video = cv2.VideoCapture(where)
         if not self._video.isOpened():
             raise DataError(
                 f"{name}: OpenCV cannot open it; check the name, and that no other program uses it"

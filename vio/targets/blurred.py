@@ -114,7 +114,14 @@ class PrintAligner:
     ) -> IntArray:
         """Half the side (K,) of each corner's window, pixels, in steps of two."""
         step = self._target.size_m
-        around = self._points[ids][:, None] + step * np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]])
+        around = self._points[ids][:, None] + step * np.array(
+            [
+                [1.0, 0],
+                [-1, 0],
+                [0, 1],
+                [0, -1],
+            ]
+        )
         side = np.linalg.norm(mapped(H, around) - uv[:, None], axis=2).mean(axis=1)
         half = np.maximum(_WINDOW.half_share * side, _WINDOW.half_sigmas * sigma_px)
         return np.asarray(
@@ -127,8 +134,10 @@ class PrintAligner:
         import cv2
 
         model, weight = self._drawn(uv, H, half, sigma_px)
-        D_u = 0.5 * (model[:, 1:-1, 2:] - model[:, 1:-1, :-2]).reshape(len(uv), -1)
-        D_v = 0.5 * (model[:, 2:, 1:-1] - model[:, :-2, 1:-1]).reshape(len(uv), -1)
+        across = model[:, 1:-1, 2:] - model[:, 1:-1, :-2]
+        down = model[:, 2:, 1:-1] - model[:, :-2, 1:-1]
+        D_u = 0.5 * across.reshape(len(uv), -1)
+        D_v = 0.5 * down.reshape(len(uv), -1)
         light = model[:, 1:-1, 1:-1].reshape(len(uv), -1)
         weight = weight[:, 1:-1, 1:-1].reshape(len(uv), -1)
         steps = np.arange(-half, half + 1, dtype=np.float64)
@@ -188,7 +197,8 @@ class PrintAligner:
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        known = (texel > -0.5).all(axis=2) & (texel[..., 0] < cols) & (texel[..., 1] < rows)
+        below_end = (texel[..., 0] < cols) & (texel[..., 1] < rows)
+        known = (texel > -0.5).all(axis=2) & below_end
         stack = np.dstack([drawn, known.astype(np.float32)])
         blurred = cv2.GaussianBlur(
             stack, (0, 0), finer * sigma_px, borderType=cv2.BORDER_REPLICATE

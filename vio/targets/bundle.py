@@ -123,7 +123,8 @@ def lens_moved(camera: CameraModel, step: FloatArray) -> CameraModel:
     Raises:
         CalibrationError: the lens model does not allow the result.
     """
-    values = np.array([camera.fu, camera.fv, camera.cu, camera.cv, *camera.coefficients]) + step
+    pinhole = (camera.fu, camera.fv, camera.cu, camera.cv)
+    values = np.array([*pinhole, *camera.coefficients]) + step
     fu, fv, cu, cv, *coefficients = values.tolist()
     return replace(camera, fu=fu, fv=fv, cu=cu, cv=cv, coefficients=tuple(coefficients))
 
@@ -175,7 +176,10 @@ class BoardAdjustment:
         weight = used / corner_sigma**2
         A, B, C, _, _ = self._normal(at, weight)
         S = C - np.einsum("vij,vik->jk", B, np.linalg.solve(A, B))
-        covariance = np.zeros_like(S) if self._fixed else np.asarray(np.linalg.inv(S))
+        if self._fixed:
+            covariance = np.zeros_like(S)
+        else:
+            covariance = np.asarray(np.linalg.inv(S))
         back = np.argsort(self._order)
         covariance = 0.5 * (covariance + covariance.T)
         return Adjusted(at, sigma, corner_sigma[back], covariance, used[back], r[back])
@@ -212,7 +216,9 @@ class BoardAdjustment:
             return self._moved(at, *_solved(system, value, fixed=self._fixed))
 
         def cost(new: RigFit | None) -> float:
-            return np.inf if new is None else self._cost(self._residuals(new), weight, new)
+            if new is None:
+                return np.inf
+            return self._cost(self._residuals(new), weight, new)
 
         found = damping.step(moved, cost, before)
         if found is None or found[0] is None:
@@ -233,7 +239,8 @@ class BoardAdjustment:
         for c, camera in enumerate(at.cameras):
             rows = np.flatnonzero(self.seen.camera == c)
             T = at.T_cam_cam0[c]
-            uv, valid = project_point(camera, p_cam0[rows] @ T[:3, :3].T + T[:3, 3])
+            p_cam = p_cam0[rows] @ T[:3, :3].T + T[:3, 3]
+            uv, valid = project_point(camera, p_cam)
             out[rows] = np.where(valid[:, None], self.seen.uv[rows] - uv, _WEIGHTS.behind_px)
         return out
 
@@ -264,7 +271,9 @@ class BoardAdjustment:
         _, first, image, count = np.unique(
             self._image[order], return_index=True, return_inverse=True, return_counts=True
         )
-        middle = 0.5 * (length[order[first + (count - 1) // 2]] + length[order[first + count // 2]])
+        below_middle = order[first + (count - 1) // 2]
+        above_middle = order[first + count // 2]
+        middle = 0.5 * (length[below_middle] + length[above_middle])
         out = np.empty(len(length))
         out[order] = (middle / MEDIAN_TO_SIGMA)[image] ** 2
         return out
@@ -330,7 +339,8 @@ class BoardAdjustment:
                 shared[rows, :, layout.poses[c - 1]] = _by_twist(D, p_cam)
             axis = at.T_cam0_board[seen.view[rows], :3, 2]
             along = np.einsum("rij,rj->ri", by_cam0, axis)
-            shared[rows, :, layout.bow] = along[:, :, None] * self._shape[seen.point[rows]][:, None]
+            shape = self._shape[seen.point[rows]]
+            shared[rows, :, layout.bow] = along[:, :, None] * shape[:, None]
             own[rows] = _by_twist(by_cam0, p_cam0[rows])
             r[rows] = np.where(valid[:, None], seen.uv[rows] - uv, 0.0)
         scale = np.sqrt(weight)[:, None]

@@ -205,7 +205,9 @@ def _explained(filmed: Filmed, camera: int, target: Target) -> Iterator[None]:
 
 
 def _check_views(filmed: Filmed, target: Target) -> None:
-    names = ("left", "right") if len(filmed.sizes) > 1 else ("only",)
+    names: tuple[str, ...] = ("only",)
+    if len(filmed.sizes) > 1:
+        names = ("left", "right")
     for c, name in enumerate(names):
         count = sum(len(view.corners[c]) >= MIN_CORNERS for view in filmed.views)
         if count < MIN_VIEWS:

@@ -133,7 +133,10 @@ class CornerDetector:
         self._may_begin_light = (
             target.kind == "checkerboard" and len(self._symmetries) == self._turns
         )
-        self._seeding = None if target.kind == "checkerboard" else MarkerReader(target)
+        if target.kind == "checkerboard":
+            self._seeding = None
+        else:
+            self._seeding = MarkerReader(target)
 
     def detect(self, image: Image) -> Corners:
         """Return the corners of the board; none where it is not seen."""
@@ -143,7 +146,9 @@ class CornerDetector:
         found = self._grown(image, board, uv, self._blur_px(image, board, uv))
         ids = np.flatnonzero(np.isfinite(found[:, 0]))
         ids = ids[self._agree(ids, found[ids])]
-        return Corners(ids, found[ids]) if len(ids) >= _GROWTH.min_corners else NO_CORNERS
+        if len(ids) >= _GROWTH.min_corners:
+            return Corners(ids, found[ids])
+        return NO_CORNERS
 
     def _seeds(self, image: Image) -> tuple[FloatArray, FloatArray]:
         """Places on the board (S, 2) and pixels (S, 2) of what is found without prediction."""
@@ -367,7 +372,8 @@ class _Templates:
         """
         if not len(ids):
             return np.zeros(0)
-        at = mapped(H, self._points[ids][:, None] + self._offset[ids]) + moved[:, None]
+        samples = self._points[ids][:, None] + self._offset[ids]
+        at = mapped(H, samples) + moved[:, None]
         at = np.clip(at, -1e4, 2e4).astype(np.float32)
         inside = (at >= 0).all(axis=2) & (at[..., 0] <= image.shape[1] - 1)
         inside &= at[..., 1] <= image.shape[0] - 1

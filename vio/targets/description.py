@@ -37,6 +37,14 @@ _FAMILY_KEYS = (
     "tagFamily",
     "family",
 )  # by which other tools name an AprilGrid's tags
+UNIT_SQUARE: FloatArray = np.array(  # corners (4, 2) in order
+    [
+        [0.0, 0.0],
+        [1.0, 0.0],
+        [1.0, 1.0],
+        [0.0, 1.0],
+    ]
+)
 MAX_SIZE_M = 1.0  # of a tag or square; a larger value is in millimetres
 MAX_COUNT = 100  # tags or squares along a side
 KNOWN = (
@@ -90,7 +98,9 @@ class Target:
     @property
     def pitch_m(self) -> float:
         """Distance from a tag or square to the next one."""
-        return self.size_m * (1 + self.ratio) if self.kind == "aprilgrid" else self.size_m
+        if self.kind == "aprilgrid":
+            return self.size_m * (1 + self.ratio)
+        return self.size_m
 
     @property
     def border_bits(self) -> int:
@@ -119,8 +129,7 @@ class Target:
         """Corners (4, 2) of the tag with a number, counted from the bottom left."""
         from_bottom, col = divmod(number, self.cols)
         row = self.rows - 1 - from_bottom
-        square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-        return self.pitch_m * np.array([col, row]) + self.size_m * square
+        return self.pitch_m * np.array([col, row]) + self.size_m * UNIT_SQUARE
 
     def markers(self) -> list[Marker]:
         """Return the coded squares; none on a checkerboard."""
@@ -152,13 +161,14 @@ class Target:
             return [self._tag_corners(n) for n in range(self.rows * self.cols)]
         inset = 0.5 * self.size_m * (1 - self.ratio)
         side = self.ratio * self.size_m
-        square = side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) + inset
-        return [
-            square + self.size_m * np.array([col, row])
-            for row in range(self.rows)
-            for col in range(self.cols)
-            if not self.square_is_dark(row, col)
-        ]
+        marker = side * UNIT_SQUARE + inset
+        corners = []
+        for row in range(self.rows):
+            for col in range(self.cols):
+                if not self.square_is_dark(row, col):
+                    square_at = self.size_m * np.array([col, row])
+                    corners.append(marker + square_at)
+        return corners
 
     def square_is_dark(self, row: int, col: int) -> bool:
         """Return whether a square of a ChArUco or checkerboard is dark, counted from the top
@@ -239,7 +249,9 @@ def marker_dictionary(name: str) -> Any:
     """
     import cv2
 
-    number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
+    number = None
+    if name.startswith("DICT_"):
+        number = getattr(cv2.aruco, name, None)
     if not isinstance(number, int):
         known = sorted(key for key in dir(cv2.aruco) if key.startswith("DICT_"))
         near = difflib.get_close_matches(name, known, 2) or ["DICT_4X4_50", "DICT_6X6_250"]

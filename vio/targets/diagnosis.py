@@ -291,7 +291,9 @@ def _checkerboard_in(images: Sequence[Image], target: Target) -> str | None:
             is_own = target.kind == "checkerboard" and sorted(size) == sorted(
                 (target.cols, target.rows)
             )
-            return None if is_own else f"a checkerboard of {size[0]} x {size[1]} squares"
+            if is_own:
+                return None
+            return f"a checkerboard of {size[0]} x {size[1]} squares"
     return None
 
 
@@ -322,7 +324,10 @@ def _markers_in(images: Sequence[Image], target: Target) -> str | None:
         detector = cv2.aruco.ArucoDetector(marker_dictionary(name), cv2.aruco.DetectorParameters())
         for image in images:
             ids = detector.detectMarkers(image)[1]
-            numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
+            if ids is None:
+                numbers = []
+            else:
+                numbers = [int(number) for number in np.ravel(ids)]
             if len(numbers) > most:
                 most = len(numbers)
                 alike = _size_of(name) == _size_of(target.dictionary)

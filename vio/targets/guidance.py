@@ -148,7 +148,9 @@ class Guidance:
 
     def _empty_parts(self) -> list[str]:
         out: list[str] = []
-        names = ("left image", "right image") if len(self._sizes) > 1 else ("image",)
+        names: tuple[str, ...] = ("image",)
+        if len(self._sizes) > 1:
+            names = ("left image", "right image")
         for name, cells in zip(names, self._cells, strict=True):
             empty = [part_name(k) for k in np.flatnonzero(cells < _VIEWS.min_cell_corners).tolist()]
             if empty:

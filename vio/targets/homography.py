@@ -40,7 +40,8 @@ def derivative(H: FloatArray, board: FloatArray, uv: FloatArray) -> FloatArray:
     """Derivatives (K, 2, 2) of pixels (K, 2) by places (K, 2) on the board."""
     depth = np.einsum("ki,ki->k", H[:, 2, :2], board) + H[:, 2, 2]
     depth = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
-    return np.asarray((H[:, :2, :2] - uv[..., None] * H[:, 2:, :2]) / depth[:, None, None])
+    change = H[:, :2, :2] - uv[..., None] * H[:, 2:, :2]
+    return np.asarray(change / depth[:, None, None])
 
 
 def homographies(board: FloatArray, uv: FloatArray) -> FloatArray:
@@ -58,7 +59,8 @@ def homographies(board: FloatArray, uv: FloatArray) -> FloatArray:
     _, vectors = np.linalg.eigh(np.swapaxes(A, 1, 2) @ A)
     H = vectors[..., 0].reshape(-1, 3, 3)
     H = np.linalg.inv(T_uv) @ H @ T_board
-    return np.asarray(H / np.where(np.abs(H[:, 2:, 2:]) < 1e-15, 1e-15, H[:, 2:, 2:]))
+    last = H[:, 2:, 2:]
+    return np.asarray(H / np.where(np.abs(last) < 1e-15, 1e-15, last))
 
 
 def _normalising(p: FloatArray) -> FloatArray:

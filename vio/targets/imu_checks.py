@@ -74,20 +74,26 @@ def check_imu(
     size = judge_size(imu.times_ns, imu.accel)
     intervals = _intervals(times_ns, T_cam0_board)
     gyro_fit = None
-    found = [] if size.finding is None else [size.finding]
+    if size.finding is None:
+        found = []
+    else:
+        found = [size.finding]
     # With fewer, the adjustment says which rotation is missing.
     if len(intervals) >= _OFFSET.min_intervals:
         values = np.concatenate([imu.gyro, imu.accel], axis=1)
         record = record_of(intervals, imu.times_ns, values)
         step_s = median(record.end - record.begin)
         gyro_fit = fit_gyro(record, _OFFSET.min_intervals, np.sqrt(2) * rotation_sigma_rad / step_s)
-        found = found if gyro_fit is None else _judge(record, gyro_fit, size)
+        if gyro_fit is not None:
+            found = _judge(record, gyro_fit, size)
     for finding in found:
         if finding.certain:
             raise _error(finding)
     if gyro_fit is None:
         return 0.0
-    return gyro_fit.offset_s if abs(gyro_fit.offset_s) > _OFFSET.min_offset_s else 0.0
+    if abs(gyro_fit.offset_s) > _OFFSET.min_offset_s:
+        return gyro_fit.offset_s
+    return 0.0
 
 
 def _error(finding: InertialFinding) -> DataError:
@@ -117,7 +123,10 @@ def _is_mirrored(gyro_fit: GyroFit, R: FloatArray) -> bool:
 
 def _evidence(record: Record, gyro_fit: GyroFit, size: Size, R: FloatArray) -> Evidence:
     """Return what both sensors show beside the board's poses, with a rotation (3, 3)."""
-    force = None if size.unit is None else fit_force(record, gyro_fit, np.zeros(3))
+    if size.unit is None:
+        force = None
+    else:
+        force = fit_force(record, gyro_fit, np.zeros(3))
     return Evidence(
         R_cam0_imu=R,
         gyro_fit=gyro_fit,

@@ -388,8 +388,11 @@ class _Problem:
             ends = []
             for sign in (1.0, -1.0):
                 x = np.zeros(_STATE * K + self._shared)
-                column = slice(k, _STATE * K, _STATE) if k < _STATE else _STATE * K + k - _STATE
-                x[column] = sign * _ITERATIONS.numeric_step
+                step = sign * _ITERATIONS.numeric_step
+                if k < _STATE:
+                    x[k : _STATE * K : _STATE] = step
+                else:
+                    x[_STATE * K + k - _STATE] = step
                 ends.append(self._camera(*self._moved(at, x)))
             D = (ends[0] - ends[1]) / (2 * _ITERATIONS.numeric_step)
             if k < _STATE:
@@ -423,7 +426,10 @@ class _Problem:
         )
         W = _whitening(steps.covariance)
         r = np.einsum("fij,fj->fi", W, r)
-        blocks = [(columns[:-1], W @ A), (columns[1:], W @ B)]
+        blocks = [
+            (columns[:-1], W @ A),
+            (columns[1:], W @ B),
+        ]
         if len(self._chosen):
             term_columns = _STATE * K + _SHARED + np.arange(len(self._chosen))
             blocks.append((np.tile(term_columns, (K - 1, 1)), W @ motions.r_D_terms))
@@ -434,7 +440,13 @@ class _Problem:
         inverse = 1 / self._walk_sigmas()
         change = np.diff(at.body.bias, axis=0) * inverse
         D = inverse[:, :, None] * np.eye(6)
-        rows.add(change, [(columns[:-1, 9:], -D), (columns[1:, 9:], D)])
+        rows.add(
+            change,
+            [
+                (columns[:-1, 9:], -D),
+                (columns[1:, 9:], D),
+            ],
+        )
         rows.add(
             (at.body.bias[:1] / _BIAS_SIGMA), [(columns[:1, 9:], np.diag(1 / _BIAS_SIGMA)[None])]
         )
@@ -626,7 +638,9 @@ def _turn_to_z(up: FloatArray) -> FloatArray:
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9:
-        return np.eye(3) if up[2] > 0 else np.diag([1.0, -1.0, -1.0])
+        if up[2] > 0:
+            return np.eye(3)
+        return np.diag([1.0, -1.0, -1.0])
     return so3_exp(axis / sine * np.arctan2(sine, up[2]))
 
 

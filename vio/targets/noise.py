@@ -105,7 +105,8 @@ def axis_noise(curve: AllanCurve) -> AxisNoise:
     rising = np.arange(lowest, len(tau))
     # What white noise leaves there is that of the walk.
     left = curve.deviation[rising] ** 2 - N**2 / tau[rising]
-    last = float(np.sqrt(max(left[-1], 0.0)) * np.sqrt(3 / tau[-1]))
+    slope = np.sqrt(3 / tau[-1])
+    last = float(np.sqrt(max(left[-1], 0.0)) * slope)
     bound = float(curve.deviation[-1] * np.sqrt(3 / tau[-1]))
     is_bound = lowest >= len(tau) - 3
     K = bound if is_bound else last
@@ -150,7 +151,9 @@ def measure_noise(record: ImuRecord) -> ImuNoise:
     """
     seconds = 1e-9 * (record.times_ns - record.times_ns[0])
     if len(seconds) < 2 or seconds[-1] < _ALLAN.min_s:
-        length = float(seconds[-1]) if len(seconds) else 0.0
+        length = 0.0
+        if len(seconds):
+            length = float(seconds[-1])
         raise DataError(
             f"the IMU's record has {length:.0f} s, and the noise needs {_ALLAN.min_s:.0f}: record "
             "an hour or more at rest, on a heavy table"

@@ -125,7 +125,9 @@ def _png(figure: Any) -> bytes:
 
 
 def _name(found: CameraCalibration, c: int) -> str:
-    return ("left", "right")[c] if len(found.found.at.cameras) > 1 else "camera"
+    if len(found.found.at.cameras) > 1:
+        return ("left", "right")[c]
+    return "camera"
 
 
 def _draw_corners(axes: Any, found: CameraCalibration, c: int) -> None:

@@ -89,7 +89,9 @@ def open_raw(
         CalibrationError: the size of the images is not known.
     """
     path = Path(source)
-    flat = _flat_pairs(path) if path.is_dir() and image_layout(path) is None else None
+    flat = None
+    if path.is_dir() and image_layout(path) is None:
+        flat = _flat_pairs(path)
     if flat is not None:
         return _folder_of_pairs(path, flat)
     known, cameras = _size_and_cameras(source, path, size)
@@ -229,7 +231,9 @@ def _frames_of(dataset: ImageRecording, chosen: Sequence[int]) -> Iterator[tuple
     """Yield time and images of frames, increasing."""
     for frame in dataset.frames(chosen):
         if frame.left is not None:
-            images = (frame.left,) if frame.right is None else (frame.left, frame.right)
+            images: Images = (frame.left,)
+            if frame.right is not None:
+                images = (frame.left, frame.right)
             yield frame.time_ns, images
 
 

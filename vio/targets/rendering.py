@@ -60,7 +60,10 @@ def bow_depth(bow: FloatArray, target: Target, points_m: FloatArray) -> FloatArr
 def board_points(target: Target, bow: FloatArray | None = None) -> FloatArray:
     """Return the corners (N, 3) of a board in its frame, metres."""
     flat = target.points_m
-    depth = np.zeros(len(flat)) if bow is None else bow_depth(bow, target, flat)
+    if bow is None:
+        depth = np.zeros(len(flat))
+    else:
+        depth = bow_depth(bow, target, flat)
     return np.column_stack([flat, depth])
 
 
@@ -120,5 +123,6 @@ class BoardRenderer:
         p_cam = transform_points(T_cam_board, board_points(self.target, bow))
         uv, valid = project_point(self.camera, p_cam)
         c = self.camera
-        inside = (uv > -0.5).all(axis=1) & (uv[:, 0] < c.width - 0.5) & (uv[:, 1] < c.height - 0.5)
+        below_end = (uv[:, 0] < c.width - 0.5) & (uv[:, 1] < c.height - 0.5)
+        inside = (uv > -0.5).all(axis=1) & below_end
         return uv, valid & inside

@@ -53,10 +53,8 @@ def _projections(rig: Rig) -> list[tuple[FloatArray, FloatArray]]:
     """Rotation (3, 3) and projection (3, 4) of each rectified camera."""
     camera = rig.camera
     R0, R1 = rectifying_rotations(rig.stereo)[:2]
-    P0 = np.array(
-        [[camera.fu, 0, camera.cu, 0], [0, camera.fv, camera.cv, 0], [0, 0, 1, 0]],
-        dtype=np.float64,
-    )
+    P0 = np.zeros((3, 4))
+    P0[:, :3] = camera.K
     P1 = P0.copy()
     P1[0, 3] = -camera.fu * camera.baseline_m
     return [(R0, P0), (R1, P1)]
@@ -118,7 +116,10 @@ def basalt_text(rig: Rig, imu_hz: float = 200.0) -> str | None:
     intrinsics = [_basalt_camera(camera) for camera in rig.cameras]
     if None in intrinsics:
         return None
-    T_imu_cam0 = np.eye(4) if rig.T_cam0_imu is None else se3_inverse(rig.T_cam0_imu)
+    if rig.T_cam0_imu is None:
+        T_imu_cam0 = np.eye(4)
+    else:
+        T_imu_cam0 = se3_inverse(rig.T_cam0_imu)
     poses = [T_imu_cam0]
     if rig.cam1 is not None:
         poses.append(T_imu_cam0 @ se3_inverse(rig.right[1]))

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray
 from vio.records import Image
-from vio.targets.description import Marker, Target, marker_dictionary
+from vio.targets.description import UNIT_SQUARE, Marker, Target, marker_dictionary
 from vio.targets.homography import gray_at, homographies, mapped
 
 # Scale of the image in which candidates are looked for, and the pixels there by which light grows.
@@ -203,8 +203,7 @@ class _Prints:
 
     def _sampled(self, image: Image, quads: FloatArray) -> FloatArray:
         """Gray values (K, S) of quadrilaterals (K, 4, 2)."""
-        square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-        H = homographies(np.broadcast_to(square, quads.shape), quads)
+        H = homographies(np.broadcast_to(UNIT_SQUARE, quads.shape), quads)
         return gray_at(image, mapped(H, self._at[None]))
 
 

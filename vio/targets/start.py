@@ -72,11 +72,14 @@ def board_pose(camera: CameraModel, board_m: FloatArray, uv: FloatArray) -> Floa
     scale = float(np.abs(plane - centre).max())
     p = np.column_stack([(plane - centre) / scale, np.ones(len(plane))])
     zero = np.zeros_like(p)
+    by_x = x[:, :1] * p
+    by_y = x[:, 1:2] * p
+    by_z = x[:, 2:] * p
     A = np.concatenate(
         [
-            np.hstack([zero, -x[:, 2:] * p, x[:, 1:2] * p]),
-            np.hstack([x[:, 2:] * p, zero, -x[:, :1] * p]),
-            np.hstack([-x[:, 1:2] * p, x[:, :1] * p, zero]),
+            np.hstack([zero, -by_z, by_y]),
+            np.hstack([by_z, zero, -by_x]),
+            np.hstack([-by_y, by_x, zero]),
         ]
     )
     _, vectors = np.linalg.eigh(A.T @ A)
@@ -87,7 +90,8 @@ def board_pose(camera: CameraModel, board_m: FloatArray, uv: FloatArray) -> Floa
     H = H / length
     if np.sum((p @ H.T) * x) < 0:
         H = -H
-    R = nearest_rotation(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
+    normal = np.cross(H[:, 0], H[:, 1])
+    R = nearest_rotation(np.column_stack([H[:, 0], H[:, 1], normal]))
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = H[:, 2] * scale - R[:, :2] @ centre
@@ -154,7 +158,10 @@ def one_camera(
         if cost < least:
             least = cost
             best = found
-    whole = None if best is None else _adjusted(best.at.cameras[0], seen, 60)
+    if best is None:
+        whole = None
+    else:
+        whole = _adjusted(best.at.cameras[0], seen, 60)
     if whole is None:
         raise CalibrationError(
             "no focal length explains the corners of the board; check that the target file is "

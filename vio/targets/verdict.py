@@ -106,7 +106,9 @@ class Verdict:
     def depth_m(self) -> float:
         """Standard deviation of depth at `DEPTH_M`, rms over the image, inflated."""
         sigma = self.depth_sigma_m[np.isfinite(self.depth_sigma_m)]
-        return self.inflation * float(np.sqrt(np.mean(sigma**2))) if len(sigma) else float("nan")
+        if len(sigma):
+            return self.inflation * float(np.sqrt(np.mean(sigma**2)))
+        return float("nan")
 
 
 def pixel_grid(camera: CameraModel) -> FloatArray:
@@ -159,7 +161,8 @@ def projection_sigma_from_views(
     rows = rows[:: -(-len(rows) // _CHECKS.compensated_corners)]
     board = np.column_stack([seen.points_m, bow_shape(seen.points_m) @ fit.bow])
     T = fit.T_cam_cam0[camera] @ fit.T_cam0_board[seen.view[rows]]
-    corners = np.einsum("rij,rj->ri", T[:, :3, :3], board[seen.point[rows]]) + T[:, :3, 3]
+    on_board = board[seen.point[rows]]
+    corners = np.einsum("rij,rj->ri", T[:, :3, :3], on_board) + T[:, :3, 3]
     D, motion = _lens_and_motion(model, corners)
     undone = np.linalg.lstsq(
         motion.reshape(-1, motion.shape[2]), D.reshape(-1, D.shape[2]), rcond=None
@@ -220,7 +223,8 @@ def _pixels_at_depth(fit: RigFit, depth_m: float) -> tuple[FloatArray, FloatArra
     p = rays * (depth_m / np.where(valid, rays[:, 2], 1.0))[:, None]
     uv1, seen = project_point(fit.cameras[1], transform_points(fit.T_cam_cam0[1], p))
     c = fit.cameras[1]
-    inside = (uv1 >= 0).all(axis=1) & (uv1[:, 0] <= c.width - 1) & (uv1[:, 1] <= c.height - 1)
+    below_end = (uv1[:, 0] <= c.width - 1) & (uv1[:, 1] <= c.height - 1)
+    inside = (uv1 >= 0).all(axis=1) & below_end
     return uv0, uv1, valid & seen & inside
 
 
@@ -327,7 +331,10 @@ def judge(found: Adjusted, seen: Sightings, alone_sigma_px: Sequence[float]) -> 
         projection_sigma(camera, found.covariance[lens, lens])
         for camera, lens in zip(cameras, layout.lenses, strict=True)
     )
-    depth = depth_sigma(found) if seen.cameras > 1 else np.full(1, np.nan)
+    if seen.cameras > 1:
+        depth = depth_sigma(found)
+    else:
+        depth = np.full(1, np.nan)
     halves = compare_halves(found, seen)
     inflation = _inflation(halves)
     findings = [
@@ -358,7 +365,9 @@ def _inflation(halves: Halves) -> float:
     by_chance = np.sqrt(
         chi_square_quantile(_CHECKS.chance_probability, halves.unknowns) / halves.unknowns
     )
-    return max(halves.ratio, halves.map_ratio) if halves.ratio > by_chance else 1.0
+    if halves.ratio > by_chance:
+        return max(halves.ratio, halves.map_ratio)
+    return 1.0
 
 
 def _unsynchronised(found: Adjusted, alone_sigma_px: Sequence[float]) -> list[str]:
@@ -400,14 +409,18 @@ def part_name(number: int) -> str:
 def coverage_findings(seen: Sightings, cameras: Sequence[CameraModel]) -> list[str]:
     """Return which parts of the images hold no corners, one line for each camera."""
     out: list[str] = []
-    names = ("left", "right") if len(cameras) > 1 else ("",)
+    names: tuple[str, ...] = ("",)
+    if len(cameras) > 1:
+        names = ("left", "right")
     for c, camera in enumerate(cameras):
         uv = seen.uv[seen.camera == c]
         counts = corners_by_part(uv, camera.width, camera.height)
         few = np.flatnonzero(counts < _CHECKS.min_cell_share * len(uv)).tolist()
         empty = [part_name(k) for k in few]
         if empty:
-            image = f"{names[c]} image" if names[c] else "image"
+            image = "image"
+            if names[c]:
+                image = f"{names[c]} image"
             out.append(f"the {image} is empty at {', '.join(empty)}: show the board there")
     return out
 

@@ -59,8 +59,13 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
             for curve, columns in names.items()
         }
         seen = None if log_of_features is None else log_of_features.observations(index)
-        states = None if seen is None else states_of(seen, seen.has_right, _NOTHING_DONE)
-        image = next(images, None) if row % _EVERY_IMAGE == 0 else None
+        if seen is None:
+            states = None
+        else:
+            states = states_of(seen, seen.has_right, _NOTHING_DONE)
+        image = None
+        if row % _EVERY_IMAGE == 0:
+            image = next(images, None)
         viewer.show(index, estimate, numbers, image, seen, states)
         viewer.places(index, estimate, is_keyframe=index in keyframes, loops=loops.get(index, ()))
     ids = np.arange(len(run.points))

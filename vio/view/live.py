@@ -174,7 +174,8 @@ class RerunViewer:
             states: of the features (N,), see `states_of`.
         """
         self._stream.set_time("frame", sequence=index)
-        self._start_ns = estimate.time_ns if self._start_ns is None else self._start_ns
+        if self._start_ns is None:
+            self._start_ns = estimate.time_ns
         self._stream.set_time("recording", duration=1e-9 * (estimate.time_ns - self._start_ns))
         self._pose(estimate)
         self._numbers(estimate, numbers)
@@ -430,7 +431,18 @@ def outline(camera: StereoCamera) -> list[FloatArray]:
     baseline.
     """
     width, height = _size(camera)
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
+    corners = (
+        np.array(
+            [
+                [0, 0],
+                [width, 0],
+                [width, height],
+                [0, height],
+                [0, 0],
+            ]
+        )
+        - 0.5
+    )
     share = np.linspace(0, 1, _PICTURE.side)[:, None]
     border = np.concatenate([a + share * (b - a) for a, b in pairwise(corners)])
     return [

@@ -205,7 +205,9 @@ def _size_of_step(times: IntArray, logged: IntArray, row: int, last_ns: int) -> 
     if after.max() < earlier.min():  # before the recording began
         return size_ns
     same = (earlier >= after.min() - half_ns) & (earlier <= after.max() + half_ns)
-    return size_ns if same.sum() >= _BACK.min_early_share * len(after) else None
+    if same.sum() >= _BACK.min_early_share * len(after):
+        return size_ns
+    return None
 
 
 def _usual_ns(times: IntArray) -> float:
@@ -222,7 +224,9 @@ def _fallen_behind(times: IntArray, logged: IntArray, row: int) -> float:
     behind = (logged[around] - times[around]).astype(np.float64)
     more = behind[row - first :] - median(behind[: row - first])
     size_ns = median(more)
-    return size_ns if np.mean(more > 0.5 * size_ns) > _BACK.min_behind_share else 0.0
+    if np.mean(more > 0.5 * size_ns) > _BACK.min_behind_share:
+        return size_ns
+    return 0.0
 
 
 def _joined(found: Sequence[_Found]) -> list[list[_Found]]:

@@ -122,15 +122,21 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
     truth = index.reference(imu=rig.T_cam0_imu is not None)
     levels = levels_of([*index.left.bands, *index.right.bands])
     level_notes = [*levels.note, *_mosaic_notes(stamps, topics, path)]
+    T_cam0_imu = None
+    if rig.T_cam0_imu is not None:
+        T_cam0_imu = rectifier.T_rect0_imu
+    reference = None
+    if truth is not None:
+        reference = reference_of_body(truth, rig, rectifier)
     recording = Recording(
         kind="bag",
         path=path,
         camera=rectifier.camera,
-        T_cam0_imu=None if rig.T_cam0_imu is None else rectifier.T_rect0_imu,
+        T_cam0_imu=T_cam0_imu,
         frame_times_ns=times_ns,
         has_images=True,
         motion=motion.kinds,
-        reference=None if truth is None else reference_of_body(truth, rig, rectifier),
+        reference=reference,
         notes=(
             *(*rig.notes, *rectifier.notes, *image_notes, *motion_notes),
             *(*level_notes, *rig_notes, *index.notes, *found.notes),
@@ -187,7 +193,10 @@ def _stamp_notes(images: Sequence[Stamps], names: Sequence[str], twice: Sequence
         if stamps.unstamped
     ]
     if any(twice):
-        which = f"{twice[0]}" if len(twice) == 1 else f"{twice[0]} left and {twice[1]} right"
+        if len(twice) == 1:
+            which = f"{twice[0]}"
+        else:
+            which = f"{twice[0]} left and {twice[1]} right"
         notes.append(f"{which} images repeat a stamp and are skipped")
     return notes
 
@@ -200,7 +209,9 @@ def _paired_by_logging(left_ns: IntArray, right_ns: IntArray) -> tuple[IntArray,
     """Return the rows (F,), (F,) of images that were recorded closest to each other, and closer
     than half of the left camera's interval.
     """
-    interval_ns = median(np.diff(left_ns)) if len(left_ns) > 1 else 0.0
+    interval_ns = 0.0
+    if len(left_ns) > 1:
+        interval_ns = median(np.diff(left_ns))
     b = nearest(left_ns, right_ns)
     a = np.arange(len(left_ns))
     close = np.abs(right_ns[b] - left_ns) <= interval_ns / 2

@@ -51,7 +51,9 @@ def metadata_topics(topics: Mapping[str, str]) -> dict[str, str]:
         stream = _DATA.fullmatch(name)
         if stream is not None:
             found[name] = f"{stream[1]}/metadata"
-    return found if all(topics.get(name) == TEXT for name in found.values()) else {}
+    if not all(topics.get(name) == TEXT for name in found.values()):
+        return {}
+    return found
 
 
 def sdk_stamps(messages: Iterable[tuple[int, bytes]]) -> SdkStamps:

@@ -94,7 +94,9 @@ class Bag:
             self._reader = AnyReader(bag_files(self.path), default_typestore=typestore)
             self._reader.open()
             # of several files each is in order, and they are merged by time
-            only = self._reader.readers[0] if len(self._reader.readers) == 1 else None
+            only = None
+            if len(self._reader.readers) == 1:
+                only = self._reader.readers[0]
             self._set_back = only is not None and is_set_back(only)
         with named_damage(self.path):
             self._sdk = self._sdk_stamps()

@@ -74,7 +74,9 @@ class Roles:
     @property
     def cameras(self) -> tuple[Topic, ...]:
         """The image topics: left and right, or left alone."""
-        return (self.left,) if self.right is None else (self.left, self.right)
+        if self.right is None:
+            return (self.left,)
+        return (self.left, self.right)
 
 
 def choose(topics: Sequence[Topic], named: str | None, where: str) -> tuple[Roles, tuple[str, ...]]:
@@ -100,7 +102,10 @@ def choose(topics: Sequence[Topic], named: str | None, where: str) -> tuple[Role
     else:
         left, right = _cameras(filled, given, where, notes)
     imu, accel = _imu(filled, given, left, notes)
-    reference = given["reference"] if "reference" in given else _reference(filled, notes)
+    if "reference" in given:
+        reference = given["reference"]
+    else:
+        reference = _reference(filled, notes)
     velocity = given.get("velocity")
     if "velocity" not in given and imu is None:
         velocity = _only_velocity(filled, reference)
@@ -126,7 +131,10 @@ def _named(topics: Sequence[Topic], named: str | None, where: str) -> dict[str, 
                 f"--topics {named!r}: {part!r} is no ROLE=/TOPIC; roles are {', '.join(_ROLES)}"
             )
         left_out = name == "none" and role != "left"
-        given[role] = None if left_out else _topic_for(role, name, topics, where)
+        if left_out:
+            given[role] = None
+        else:
+            given[role] = _topic_for(role, name, topics, where)
     return given
 
 
@@ -374,4 +382,6 @@ def _not_used(topics: Sequence[Topic], roles: Roles) -> list[str]:
     empty = [t.name for t in topics if not t.count]
     others = [t.name for t in topics if t.count and t not in used and t.kind not in _NO_STREAMS]
     notes = [f"topics without a message: {listed(empty)}"] if empty else []
-    return [*notes, f"not used: {listed(others)}"] if others else notes
+    if others:
+        return [*notes, f"not used: {listed(others)}"]
+    return notes

@@ -20,6 +20,7 @@ from vio.datasets.rigs.source import Size, no_image_size
 from vio.errors import CalibrationError
 from vio.files.text import text_lines
 from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import intrinsic_matrix
 
 # `458,654 457,296 367,215 248,375`: commas within numbers, and white space between them
 _DECIMAL_COMMAS = re.compile(r"(?=.*,)[+-]?\d+(?:,\d+)?(?:[\s;]+[+-]?\d+(?:,\d+)?)+")
@@ -50,7 +51,7 @@ def read_bare(path: Path, size: Size | None) -> Rig:
         raise no_image_size(path)
     if len(rows) == 1:
         fx, fy, cx, cy, *bend = rows[0].tolist()
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        K = intrinsic_matrix(fx, fy, cx, cy)
     else:
         K = rows[:3, :3]
         bend = []

@@ -5,6 +5,7 @@ of the target, which the file does not state.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,11 +65,21 @@ def _camera(block: ElementTree.Element, where: str) -> CameraModel:
     radial = [d.text for d in block.findall("radial/double")]
     k = [*_numbers(radial, len(radial), f"{where}, radial"), 0.0, 0.0, 0.0][:3]
     t1, t2 = (as_number(block.findtext(name) or 0.0) for name in ("t1", "t2"))
-    # BoofCV's tangential terms are x += 2 t1 x y + t2 (r^2 + 2 x^2), as OpenCV's p1, p2.
-    coefficients = (k[0], k[1], t1, t2, k[2]) if k[2] else (k[0], k[1], t1, t2)
+    coefficients = _coefficients(k, t1, t2)
     with naming(where):
         K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         return camera_from_matrix(K, *image_size([width, height], where), "radtan", coefficients)
+
+
+def _coefficients(radial: Sequence[float], t1: float, t2: float) -> tuple[float, ...]:
+    """Return OpenCV's k1, k2, p1, p2 and, where it is not zero, k3.
+
+    BoofCV's tangential terms are x += 2 t1 x y + t2 (r^2 + 2 x^2), as OpenCV's p1, p2.
+    """
+    k1, k2, k3 = radial
+    if k3:
+        return (k1, k2, t1, t2, k3)
+    return (k1, k2, t1, t2)
 
 
 def _child(parent: ElementTree.Element, name: str, path: Path) -> ElementTree.Element:
@@ -129,9 +140,12 @@ def _camera_of_yaml(source: Source, side: str) -> CameraModel:
     fx, fy, cx, cy, skew, *size = (numbers(pinhole, name, where, 1)[0] for name in names)
     bend = block.get("radial_tangential")
     bend = bend if isinstance(bend, dict) else {}
-    k = [*numbers(bend, "radial", where), 0.0, 0.0, 0.0][:3] if bend.get("radial") else [0.0] * 3
+    if bend.get("radial"):
+        k = [*numbers(bend, "radial", where), 0.0, 0.0, 0.0][:3]
+    else:
+        k = [0.0] * 3
     t1, t2 = (as_number(bend.get(name) or 0.0) for name in ("t1", "t2"))
     with naming(where):
         K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        D = (k[0], k[1], t1, t2, k[2]) if k[2] else (k[0], k[1], t1, t2)
+        D = _coefficients(k, t1, t2)
         return camera_from_matrix(K, *image_size(size, where), "radtan", D)

@@ -68,7 +68,11 @@ class CameraInfo:
         if whole or (self.roi is None and along_u == along_v == 1):
             return self
         change = np.array(
-            [[1 / along_u, 0, -x / along_u], [0, 1 / along_v, -y / along_v], [0, 0, 1]]
+            [
+                [1 / along_u, 0, -x / along_u],
+                [0, 1 / along_v, -y / along_v],
+                [0, 0, 1],
+            ]
         )
         return replace(
             self,

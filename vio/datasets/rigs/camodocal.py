@@ -57,7 +57,10 @@ def read(source: Source) -> Rig:
     Raises:
         CalibrationError: a file or an entry is missing or impossible.
     """
-    rig = _settings(source) if "cam0_calib" in source.entries else _alone(source)
+    if "cam0_calib" in source.entries:
+        rig = _settings(source)
+    else:
+        rig = _alone(source)
     return checked_rig(rig, source.where)
 
 
@@ -105,7 +108,9 @@ def _pose(entries: Entries, name: str, where: str) -> FloatArray:
 
 def _imu(source: Source) -> ImuSheet:
     entries = source.entries
-    offset_s = numbers(entries, "td", source.where, 1)[0] if "td" in entries else 0.0
+    offset_s = 0.0
+    if "td" in entries:
+        offset_s = numbers(entries, "td", source.where, 1)[0]
     notes: tuple[str, ...] = ()
     if any(name in entries for name in _NOISE):
         notes = (f"{source.where}: acc_n and gyr_n are of a sample and not used",)

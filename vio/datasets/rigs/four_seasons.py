@@ -31,6 +31,7 @@ from vio.geometry.lie import (
     se3_from_parts,
     se3_inverse,
 )
+from vio.geometry.stereo import intrinsic_matrix
 
 STEREO = "undistorted_calib_stereo.txt"
 TRANSFORMS = "Transformations.txt"
@@ -81,7 +82,9 @@ def read_imu_transform(path: Path) -> FloatArray:
 
 
 def _camera(path: Path) -> CameraModel:
-    lines = [line.split() for _, line in text_lines(path) if line.strip()] if path.is_file() else []
+    lines = []
+    if path.is_file():
+        lines = [line.split() for _, line in text_lines(path) if line.strip()]
     if len(lines) < 2 or lines[0][0].lower() != "pinhole" or len(lines[0]) < 5:
         raise CalibrationError(
             f"{path}: is missing or not of the form 'Pinhole fx fy cx cy …' with the size below"
@@ -92,6 +95,6 @@ def _camera(path: Path) -> CameraModel:
     except ValueError as error:
         raise CalibrationError(f"{path}: holds no number ({error}); copy it again") from error
     width, height = image_size(size, str(path))
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    K = intrinsic_matrix(fx, fy, cx, cy)
     with naming(path):
         return camera_from_matrix(K, width, height)

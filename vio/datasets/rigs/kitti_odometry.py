@@ -31,7 +31,10 @@ def kitti_rig(
         CalibrationError: a file is invalid, or no image size is given.
     """
     if cameras is None:
-        cameras = (0, 1) if any(line.startswith("P0:") for _, line in text_lines(path)) else (2, 3)
+        if any(line.startswith("P0:") for _, line in text_lines(path)):
+            cameras = (0, 1)
+        else:
+            cameras = (2, 3)
     calibration = read_calibration(path, cameras)
     if image_size is None:
         raise no_image_size(path)

@@ -23,6 +23,7 @@ from vio.datasets.yaml_files import Entries, matrix, numbers, section, tool_lens
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import checked_transform
+from vio.geometry.stereo import intrinsic_matrix
 
 _POSE = "opencv_stereo_calibrate"
 
@@ -63,6 +64,6 @@ def _camera(item: Mapping[str, Any], where: str) -> CameraModel:
     D = tuple(numbers(bend, name, where, 1)[0] for name in names)
     stated = section(item, "resolution", where)
     size = image_size([numbers(stated, name, where, 1)[0] for name in ("width", "height")], where)
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    K = intrinsic_matrix(fx, fy, cx, cy)
     with naming(where):
         return camera_from_matrix(K, *size, model, coefficients_of(model, D))

@@ -28,6 +28,7 @@ from vio.errors import CalibrationError
 from vio.files.text import text_lines
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import se3_from_parts, so3_exp
+from vio.geometry.stereo import intrinsic_matrix
 
 _MM = 1e-3  # metres
 SIZES: dict[str, Size] = {
@@ -108,7 +109,7 @@ def _camera(source: Source, name: str, size: Size) -> CameraModel:
     where = f"{source.where}, {name}"
     block = _block(source.entries, name, source.where)
     fx, fy, cx, cy = (_number(block, (key,), where) for key in ("fx", "fy", "cx", "cy"))
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    K = intrinsic_matrix(fx, fy, cx, cy)
     side = name.split("_")[0]
     stated = source.entries.get(f"{side}_DISTO", block)
     bend = stated if isinstance(stated, dict) else block

@@ -27,7 +27,10 @@ from vio.geometry.lie import FloatArray
 def _limit(c: Coefficients) -> float:
     """Return -cos of the angle off the axis up to which the model projects (equation 43)."""
     xi, alpha = c
-    limit = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
+    if alpha <= 0.5:
+        limit = alpha / (1 - alpha)
+    else:
+        limit = (1 - alpha) / alpha
     return float((limit + xi) / np.sqrt(2 * limit * xi + xi * xi + 1))
 
 
@@ -70,7 +73,8 @@ class DoubleSphere(Lens):
         root = 1 - (2 * alpha - 1) * r2
         valid: BoolArray = np.isfinite(r2) & (root >= 0)
         r2 = np.where(valid, r2, 0.0)
-        mz = (1 - alpha * alpha * r2) / (alpha * np.sqrt(np.where(valid, root, 0.0)) + 1 - alpha)
+        divisor = alpha * np.sqrt(np.where(valid, root, 0.0)) + 1 - alpha
+        mz = (1 - alpha * alpha * r2) / divisor
         second = mz * mz + (1 - xi * xi) * r2
         valid = valid & (second >= 0)
         scale = (mz * xi + np.sqrt(np.where(valid, second, 0.0))) / (mz * mz + r2)
@@ -81,7 +85,8 @@ class DoubleSphere(Lens):
         d1 = np.maximum(np.linalg.norm(p, axis=-1), TINY)
         xy, valid = self.project(c, p)
         shifted = xi * d1 + p[..., 2]
-        d2 = np.maximum(np.sqrt(p[..., 0] ** 2 + p[..., 1] ** 2 + shifted**2), TINY)
+        square = p[..., 0] ** 2 + p[..., 1] ** 2 + shifted**2
+        d2 = np.maximum(np.sqrt(square), TINY)
         inverse = 1 / np.where(valid, alpha * d2 + (1 - alpha) * shifted, 1.0)
         shifted_by_p = xi * p / d1[..., None]
         shifted_by_p[..., 2] += 1

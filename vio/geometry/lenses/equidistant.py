@@ -123,7 +123,9 @@ class Equidistant(Lens):
     def bent(
         self, c: Coefficients, radial: tuple[float, float], tangential: tuple[float, float]
     ) -> tuple[str, Coefficients]:
-        return self.name, (c[0] + radial[0], c[1] + radial[1], *c[2:])
+        k1 = c[0] + radial[0]
+        k2 = c[1] + radial[1]
+        return self.name, (k1, k2, *c[2:])
 
 
 LENS = Equidistant()

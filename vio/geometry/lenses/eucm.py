@@ -28,7 +28,9 @@ from vio.geometry.lie import FloatArray
 
 def _limit(alpha: float) -> float:
     """Return -z / d beyond which the ellipsoid's image folds back, or lies behind the pinhole."""
-    return alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
+    if alpha <= 0.5:
+        return alpha / (1 - alpha)
+    return (1 - alpha) / alpha
 
 
 class EnhancedUnified(Lens):
@@ -90,7 +92,8 @@ class EnhancedUnified(Lens):
         alpha, beta = c
         limit = _limit(alpha)
         # z = -limit d: the angle behind the image plane
-        return float(np.pi / 2 + np.arctan2(limit * np.sqrt(beta), np.sqrt(1 - limit * limit)))
+        beyond = np.arctan2(limit * np.sqrt(beta), np.sqrt(1 - limit * limit))
+        return float(np.pi / 2 + beyond)
 
     def start(self, count: int) -> Coefficients:
         return (0.5, 1.0)

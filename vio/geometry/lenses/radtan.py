@@ -165,8 +165,9 @@ def distort_by_coefficients(c: Coefficients, xy: FloatArray) -> FloatArray:
     out = np.empty((*xy.shape[:-1], 2, len(c)))
     out[..., 0] = above * powers[0][..., None]
     out[..., 1] = above * powers[1][..., None]
-    out[..., 2] = np.stack([2 * x * y, r2 + 2 * y * y], axis=-1)
-    out[..., 3] = np.stack([r2 + 2 * x * x, 2 * x * y], axis=-1)
+    both = 2 * x * y
+    out[..., 2] = np.stack([both, r2 + 2 * y * y], axis=-1)
+    out[..., 3] = np.stack([r2 + 2 * x * x, both], axis=-1)
     if len(c) > 4:
         out[..., 4] = above * powers[2][..., None]
     if divisor is not None:
@@ -187,7 +188,9 @@ def max_radius(c: Coefficients) -> float:
     # In 1/r^2 the polynomial is monic, which avoids dividing by a small coefficient.
     roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
     inverse = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 1e-12]
-    return float(1 / np.sqrt(max(inverse))) if inverse else np.inf
+    if inverse:
+        return float(1 / np.sqrt(max(inverse)))
+    return np.inf
 
 
 def _rational_max_radius(above: tuple[float, ...], below: tuple[float, ...]) -> float:
@@ -197,9 +200,12 @@ def _rational_max_radius(above: tuple[float, ...], below: tuple[float, ...]) -> 
     n = np.polynomial.Polynomial(above)
     d = np.polynomial.Polynomial(below)
     s = np.polynomial.Polynomial([0.0, 1.0])
-    roots = [*(n * d + 2 * s * (n.deriv() * d - n * d.deriv())).roots(), *d.roots()]
+    slope = n * d + 2 * s * (n.deriv() * d - n * d.deriv())
+    roots = [*slope.roots(), *d.roots()]
     positive = [float(root.real) for root in roots if abs(root.imag) < 1e-9 and root.real > 1e-12]
-    return float(np.sqrt(min(positive))) if positive else np.inf
+    if positive:
+        return float(np.sqrt(min(positive)))
+    return np.inf
 
 
 def distorted(c: Coefficients, xy: FloatArray, valid: BoolArray) -> tuple[FloatArray, BoolArray]:

@@ -77,7 +77,9 @@ class Unified(Lens):
 
     def project(self, c: Coefficients, p: FloatArray) -> tuple[FloatArray, BoolArray]:
         xy, valid = _sphere(c[0], p)
-        return distorted(c[1:], xy, valid) if len(c) > 1 else (xy, valid)
+        if len(c) > 1:
+            return distorted(c[1:], xy, valid)
+        return (xy, valid)
 
     def unproject(self, c: Coefficients, xy: FloatArray) -> tuple[FloatArray, BoolArray]:
         valid: BoolArray = np.asarray(np.isfinite(xy).all(axis=-1))
@@ -107,7 +109,9 @@ class Unified(Lens):
         if not np.isfinite(radius):
             return fold
         ray, inside = _sphere_ray(c[0], np.array([radius, 0.0]))
-        return min(fold, float(np.arctan2(ray[0], ray[2]))) if inside else fold
+        if inside:
+            return min(fold, float(np.arctan2(ray[0], ray[2])))
+        return fold
 
     def start(self, count: int) -> Coefficients:
         return (0.8, *(0.0,) * (count - 1))

@@ -153,7 +153,10 @@ def _add_points(
             elements.append(pycolmap.TrackElement(image_id(k, LEFT), row - int(begins[k])))
             if tracks.has_right[row]:
                 elements.append(pycolmap.TrackElement(image_id(k, RIGHT), int(right_index[row])))
-        colour = np.full(3, _GRAY, dtype=np.uint8) if colours is None else colours[m]
+        if colours is None:
+            colour = np.full(3, _GRAY, dtype=np.uint8)
+        else:
+            colour = colours[m]
         model.add_point3D(p, pycolmap.Track(elements), colour)
 
 

@@ -64,7 +64,9 @@ def sift_matches(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
     best1 = np.argmin(distance, axis=1)
     best0 = np.argmin(distance, axis=0)
     two = np.partition(distance, 1, axis=1)[:, :2]
-    good = (best0[best1] == np.arange(len(keys0))) & (two[:, 0] < _PAIRS.max_ratio**2 * two[:, 1])
+    mutual = best0[best1] == np.arange(len(keys0))
+    distinct = two[:, 0] < _PAIRS.max_ratio**2 * two[:, 1]
+    good = mutual & distinct
     uv0, uv1 = (np.array([key.pt for key in keys], dtype=np.float64) for keys in (keys0, keys1))
     return uv0[good], uv1[best1[good]]
 

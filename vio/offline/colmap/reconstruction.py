@@ -131,12 +131,15 @@ def pairs_to_match(names: ModelImages, loops: IntArray) -> list[tuple[str, str]]
     """Return the pairs of image files to match, each once."""
     count = len(names.left)
     out = list(zip(names.left, names.right, strict=True))
-    steps = range(1, count) if count <= _MODEL.exhaustive_images else _NEXT
+    steps: Sequence[int] = _NEXT
+    if count <= _MODEL.exhaustive_images:
+        steps = range(1, count)
     out += [(names.left[k], names.left[k + step]) for step in steps for k in range(count - step)]
     out += [
         (names.right[k], names.left[k + step]) for step in _CROSS_NEXT for k in range(count - step)
     ]
-    out += [(names.left[a], names.left[b]) for a, b in _around(loops) if 0 <= a < b < count]
+    around = [(a, b) for a, b in _around(loops) if 0 <= a < b < count]
+    out += [(names.left[a], names.left[b]) for a, b in around]
     return list(dict.fromkeys(out))
 
 
@@ -197,7 +200,8 @@ def reconstruct(
     keyframes = np.array([k for k, _ in found], dtype=np.int64)
     points = _common_points(model, [names.left[k] for k in keyframes.tolist()])
     ends = np.searchsorted(keyframes, loops).clip(0, len(keyframes) - 1)
-    of_loops = np.where((keyframes[ends] == loops).all(axis=1), points[ends[:, 0], ends[:, 1]], 0)
+    both_ends = (keyframes[ends] == loops).all(axis=1)
+    of_loops = np.where(both_ends, points[ends[:, 0], ends[:, 1]], 0)
     return Reconstructed(
         mapper,
         se3_inverse(np.array([T for _, T in found])),
