@@ -250,7 +250,10 @@ def _kind_of_folder(path: Path) -> str | None:
     if not inside:
         return possible
     first = [f"{name} ({kind})" for name, kind in list(inside.items())[:_MAX_NAMED]]
-    more = f" and {len(inside) - len(first)} more" if len(inside) > len(first) else ""
+    if len(inside) > len(first):
+        more = f" and {len(inside) - len(first)} more"
+    else:
+        more = ""
     raise DataError(
         f"{path}: is no recording, but holds {', '.join(first)}{more}; name one of them, such as "
         f"{path / next(iter(inside))}"

@@ -298,7 +298,10 @@ def _first_file(folders: Sequence[Path], names: Sequence[str]) -> Path | None:
         files = (folder / name for name in names)
         if (found := next((file for file in files if file.is_file()), None)) is not None:
             return found
-        listed = {file.name.lower(): file for file in folder.iterdir()} if folder.is_dir() else {}
+        if folder.is_dir():
+            listed = {file.name.lower(): file for file in folder.iterdir()}
+        else:
+            listed = {}
         found = next((listed[name] for name in names if name in listed), None)
         if found is not None and found.is_file():
             return found  # as a phone's logger names them: Gyro.txt

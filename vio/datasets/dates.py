@@ -46,7 +46,9 @@ def undated(line: str) -> str:
     if line[4:5] != "-" or (found := _WRITTEN.match(line)) is None:
         return line
     rest = line[found.end() :]
-    return f"{date_ns(found[0])}{rest}" if rest[:1] in ",;\t " else line
+    if rest[:1] in ",;\t ":
+        return f"{date_ns(found[0])}{rest}"
+    return line
 
 
 def dates_in_names(stems: Sequence[str]) -> IntArray | None:

@@ -345,7 +345,10 @@ def numbers_in_names(pairs: ImagePairs) -> IntArray | None:
     """Return the numbers (F,) by which left images are named where they count frames, that is
     increase and are no times; None: they do not.
     """
-    files = pairs.left if isinstance(pairs, FilePairs) else [left for left, _ in pairs]
+    if isinstance(pairs, FilePairs):
+        files = pairs.left
+    else:
+        files = [left for left, _ in pairs]
     names = files.names if isinstance(files, ImageFiles) else [file.name for file in files]
     stems = [stem_of(name) for name in names]
     if all(map(str.isdecimal, stems)):
@@ -391,7 +394,10 @@ def _file_of_times(layout: Layout) -> Path | None:
 
 def _slow_note(file: Path, times_ns: IntArray) -> tuple[str, ...]:
     """Doubt the unit of times that are further apart than those of any camera that moves."""
-    apart_s = float(np.median(np.diff(times_ns))) / NS_PER_S if len(times_ns) > 1 else 0.0
+    if len(times_ns) > 1:
+        apart_s = float(np.median(np.diff(times_ns))) / NS_PER_S
+    else:
+        apart_s = 0.0
     if apart_s <= FRAME_PACE.most_s:  # times in milliseconds are further apart
         return ()
     return (

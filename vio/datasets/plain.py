@@ -133,7 +133,9 @@ def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
     names = [str(folder) for folder in image_folders(path)]
     pairs = pairs_of(names)
     pair = first_pair(pairs)
-    return None if pair is None else Layout(path, path, *(path / name for name in pair))
+    if pair is None:
+        return None
+    return Layout(path, path, *(path / name for name in pair))
 
 
 def side_by_side(path: Path, calibration: Path | None = None) -> Layout | None:
@@ -216,7 +218,10 @@ def seen_folders(path: Path) -> str:
     if not found:
         return "no folder of images"
     names = [str(folder) for folder in found]
-    listed = f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
+    if len(names) > 1:
+        listed = f"{', '.join(names[:-1])} and {names[-1]}"
+    else:
+        listed = names[0]
     counts = set(found.values())
     if len(counts) == 1:
         return f"{listed} with {counts.pop()} images{' each' if len(names) > 1 else ''}"

@@ -367,7 +367,10 @@ def read_sensor_table(
     table = read_table(path, 4, f"timestamp, {sensor} x y z [{si}]", notes)
     times_ns, values = _readings(table, stamps_ns(table, SAMPLE_PACE, notes), notes)
     axes = [_sensor_and_axis(cell)[1] for cell in table.header[1:]]
-    order = [axes.index(axis) for axis in "xyz"] if sorted(axes) == ["x", "y", "z"] else range(3)
+    if sorted(axes) == ["x", "y", "z"]:
+        order = [axes.index(axis) for axis in "xyz"]
+    else:
+        order = [0, 1, 2]
     factor, said = _factor(table, order, units, sensor, si)
     notes += said
     return times_ns, values[:, order] * factor
@@ -482,7 +485,10 @@ def _factor(
     Raises:
         DataError: the header states several units of them.
     """
-    cells = [table.header[1 + k] for k in columns] if table.header else []
+    if table.header:
+        cells = [table.header[1 + k] for k in columns]
+    else:
+        cells = []
     stated = {factor_of(cell, units) for cell in cells} - {None}
     if len(stated) > 1:
         raise DataError(
@@ -526,7 +532,10 @@ def _imu_order(table: NumberTable) -> Sequence[int] | None:
         return None
     wanted = list(itertools.product("wa", "xyz"))
     counts = [len(found.get(key, ())) for key in wanted]
-    others = found.keys() - wanted if len(table.header) <= _IMU_COLUMNS else set()
+    if len(table.header) <= _IMU_COLUMNS:
+        others = found.keys() - wanted
+    else:
+        others = set()
     if others or counts != [1] * len(wanted):
         raise DataError(
             f"{table.path}: the header {','.join(table.header)[:80]!r} does not name gyro and "

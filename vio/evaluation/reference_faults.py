@@ -123,7 +123,10 @@ def _errors(x: FloatArray, y: FloatArray, used: BoolArray | None = None) -> Floa
 
     Reference: Umeyama (1991), equation 34.
     """
-    weights = np.ones((1, len(x))) if used is None else used.astype(np.float64)
+    if used is None:
+        weights = np.ones((1, len(x)))
+    else:
+        weights = used.astype(np.float64)
     weights = (weights / weights.sum(axis=1, keepdims=True))[..., None]
     x = x - np.sum(weights * x, axis=1, keepdims=True)
     y = y - np.sum(weights * y, axis=1, keepdims=True)

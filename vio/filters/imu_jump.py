@@ -229,7 +229,10 @@ class GyroJump:
         self._recent.append((step, window.last_step_s))
         for count in (_LASTING.few_steps, _LASTING.steps):
             newest = list(self._recent)[-count:]
-            turn = None if len(newest) < count else _common_turn([step for step, _ in newest])
+            if len(newest) < count:
+                turn = None
+            else:
+                turn = _common_turn([step for step, _ in newest])
             if turn is not None:
                 seconds = sum(seconds for _, seconds in newest)
                 self.doubt(window.nav.gyro_bias, np.sqrt(np.diag(window.prior.P)[9:12]))
@@ -284,7 +287,9 @@ class GyroJump:
         before, sigma = self._before
         self._before = None
         changed = float(np.linalg.norm(bias - before))
-        return changed if changed > _JUMP.changed_sigmas * float(np.linalg.norm(sigma)) else None
+        if changed > _JUMP.changed_sigmas * float(np.linalg.norm(sigma)):
+            return changed
+        return None
 
 
 def _common_turn(steps: list[StepErrors]) -> FloatArray | None:

@@ -48,7 +48,11 @@ def checked_extrinsics(T_cam0_imu: npt.ArrayLike) -> FloatArray:
         raise CalibrationError(
             f"T_cam0_imu is no matrix of numbers ({error}); give a (4, 4) array"
         ) from error
-    fault = f"has the shape {T.shape} instead of (4, 4)" if T.shape != (4, 4) else rigid_fault(T)
+    fault: str | None
+    if T.shape != (4, 4):
+        fault = f"has the shape {T.shape} instead of (4, 4)"
+    else:
+        fault = rigid_fault(T)
     if fault is None and not np.abs(T[:3, 3]).max() <= _FARTHEST_M:
         fault = f"puts the camera {np.abs(T[:3, 3]).max() / 1e3:g} km from the IMU; translations are in metres"
     if fault is not None:

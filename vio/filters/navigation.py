@@ -288,7 +288,10 @@ class ImuMotion:
         if len(self._chosen):
             readings = np.empty_like(raw)
             loops.calibrate(raw, ENTRIES, nav.imu_terms, readings)
-            levers = raw if self._usual is None else significant(raw, self._usual, total, densities)
+            if self._usual is None:
+                levers = raw
+            else:
+                levers = significant(raw, self._usual, total, densities)
             Phi_imu = np.zeros((DIM, len(self._chosen)))
             terms = loops.TermColumns(levers, self._entries, Phi_imu)
         loops.integrate(times, readings, bias, self._gravity, noise, terms, step)

@@ -76,7 +76,10 @@ class ProjectedDots(ImageCheck):
     def _look(self, images: FrameImages) -> None:
         """Compare the left image with one of a moment before."""
         time_ns = images.frame.time_ns
-        elapsed_s = np.inf if self._last is None else (time_ns - self._last[0]) / NS_PER_S
+        if self._last is None:
+            elapsed_s = np.inf
+        else:
+            elapsed_s = (time_ns - self._last[0]) / NS_PER_S
         if elapsed_s < _DOTS.min_s:
             return
         last = self._last

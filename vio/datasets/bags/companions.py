@@ -166,7 +166,9 @@ def _stereo_pose_of_frames(index: BagIndex) -> FloatArray | None:
     """Return the pose (4, 4) of the left camera in the right one, as the bag's frames state it."""
     left = index.left.frame_id
     right = index.right.frame_id
-    return None if left == right else index.transform(right.lstrip("/"), left.lstrip("/"))
+    if left == right:
+        return None
+    return index.transform(right.lstrip("/"), left.lstrip("/"))
 
 
 def _with_static_pose(rig: Rig, found: Contents) -> Rig:

@@ -142,7 +142,10 @@ def _sdk_transforms(bag: Bag, sensors: Sequence[Topic]) -> dict[str, FloatArray]
     group = None
     for sensor in sensors:
         stream = _SDK_STREAM.fullmatch(sensor.name)
-        names = [] if stream is None else [n for n in first if n.startswith(f"{stream[1]}/tf/")]
+        if stream is None:
+            names = []
+        else:
+            names = [n for n in first if n.startswith(f"{stream[1]}/tf/")]
         named = {name.rsplit("/", 1)[-1]: name for name in names}
         if group is None and named:
             group = min(named)

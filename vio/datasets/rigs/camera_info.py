@@ -129,7 +129,9 @@ def pair_of_files(path: Path) -> tuple[Path, Path] | None:
     else:
         found = [pair for pair in pairs if path.name in pair]
     pair = first_pair(found)
-    return None if pair is None else (folder / pair[0], folder / pair[1])
+    if pair is None:
+        return None
+    return (folder / pair[0], folder / pair[1])
 
 
 def _is_yaml(file: Path) -> bool:

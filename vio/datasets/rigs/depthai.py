@@ -113,7 +113,11 @@ def _camera(block: Mapping[str, Any], size: Size | None, where: str) -> CameraMo
     K = matrix(block.get("intrinsicMatrix"), (3, 3), f"{where}, intrinsicMatrix")
     D = numbers(block, "distortionCoeff", where) if block.get("distortionCoeff") else ()
     kind = as_number(block.get("cameraType", 0))
-    name = _TYPES[int(kind)] if kind in range(len(_TYPES)) else block.get("cameraType")
+    name: Any
+    if kind in range(len(_TYPES)):
+        name = _TYPES[int(kind)]
+    else:
+        name = block.get("cameraType")
     model, _ = tool_lens("depthai", name, f"{where}, cameraType")
     used = stated
     if size is not None and size != stated:

@@ -217,7 +217,9 @@ def _camera_infos(source: Source) -> Rig:
     pair = None if source.cameras == 1 else pair_of_files(source.path)
     infos = [read_camera_info(file) for file in pair or (source.path,)]
     rig = rig_from_camera_infos(infos, image_size=source.image_size)
-    return rig if pair is not None else _alone(rig, source, stated=bool(infos[0].P[0, 3]))
+    if pair is not None:
+        return rig
+    return _alone(rig, source, stated=bool(infos[0].P[0, 3]))
 
 
 def _alone(rig: Rig, source: Source, *, stated: bool) -> Rig:

@@ -117,8 +117,13 @@ def _one_file_each(path: Path) -> tuple[Path, Path] | None:
     beside = sorted(file.name for file in path.parent.glob(f"*{path.suffix}"))
     pairs = [pair for pair in pairs_of(beside) if path.name in pair]
     pair = first_pair(pairs)
-    files = None if pair is None else (path.with_name(pair[0]), path.with_name(pair[1]))
-    return None if files is None or any(_lone_camera(file) is None for file in files) else files
+    if pair is None:
+        files = None
+    else:
+        files = (path.with_name(pair[0]), path.with_name(pair[1]))
+    if files is None or any(_lone_camera(file) is None for file in files):
+        return None
+    return files
 
 
 def _lone_camera(file: Path) -> object:
@@ -302,7 +307,9 @@ def _imu_sheet(file: Path) -> Entries:
     except DataError:
         return {}
     block = entries.get("imu0")
-    return {str(k): v for k, v in block.items()} if isinstance(block, dict) else entries
+    if isinstance(block, dict):
+        return {str(k): v for k, v in block.items()}
+    return entries
 
 
 def _unapplied(sheet: Entries, file: Path) -> list[str]:

@@ -243,7 +243,10 @@ def trimmed_coefficients(D: Sequence[float]) -> tuple[float, ...]:
         raise CalibrationError(
             "thin-prism or tilt coefficients are not read; calibrate without CALIB_THIN_PRISM_MODEL"
         )
-    kept = D[:8] if any(D[5:8]) else D[:5]
+    if any(D[5:8]):
+        kept = D[:8]
+    else:
+        kept = D[:5]
     return tuple(float(d) for d in kept)
 
 

@@ -86,7 +86,10 @@ def _agreeing(rig: Rig, entries: Entries, where: str) -> Rig:
     other = as_number(entries.get(key))
     if key not in entries:
         key = "Camera.bf / Camera.fx"
-        other = as_number(entries.get("Camera.bf")) / focal if focal > 0 else np.nan
+        if focal > 0:
+            other = as_number(entries.get("Camera.bf")) / focal
+        else:
+            other = np.nan
     if not np.isfinite(other):
         return rig
     baseline = float(np.linalg.norm(rig.right[1][:3, 3]))
