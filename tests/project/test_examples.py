@@ -56,7 +56,7 @@ def test_examples_are_short_and_tested(path: Path) -> None:
 def test_a_live_loop_prints_a_pose_for_every_frame(flight: Path) -> None:
     text = _run("live_loop.py", flight, process=True)
     # A machine at full load may leave out frames, and says how many.
-    found = re.search(r"results=(\d+), dropped=(\d+), refused=0, waiting=0", text)
+    found = re.search(r"(\d+) frames with a pose, (\d+) left out; latency", text)
     poses, dropped = int(found[1]), int(found[2])
     assert poses + dropped == 16
     assert len(re.findall(r"^\d+\.\d{3} s .* m$", text, re.MULTILINE)) == poses
