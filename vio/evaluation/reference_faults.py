@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
 
@@ -26,6 +27,7 @@ class _FaultRules(NamedTuple):
 
 
 _FAULT = _FaultRules()
+_ROUNDING: Tolerance[float] = 1e-9  # of a reference's extent: errors below it are none
 
 
 def position_fault(
@@ -113,7 +115,8 @@ def _of_shifts(
     if enough.any():
         left[enough] = _errors(x, moved[enough], used[enough])
         without = _errors(x, given, used[enough])
-        ratios[enough] = left[enough] / np.maximum(without, np.finfo(np.float64).tiny)
+        rounding = _ROUNDING * max(float(np.ptp(given)), np.finfo(np.float64).tiny)
+        ratios[enough] = (left[enough] + rounding) / (without + rounding)
     return left, ratios
 
 

@@ -74,7 +74,12 @@ class ProjectedDots(ImageCheck):
         return images.with_raw(tuple(without_dots(image) for image in images.raw))
 
     def _look(self, images: FrameImages) -> None:
-        """Compare the left image with one of a moment before."""
+        """Compare the left image with one of a moment before, unless it has fewer pixels than
+        blocks.
+        """
+        height, width = images.halves[0].shape
+        if height < _DOTS.rows or width < _DOTS.columns:
+            return
         time_ns = images.frame.time_ns
         if self._last is None:
             elapsed_s = np.inf
