@@ -17,7 +17,6 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 # this set complete and honest.
 TESTED_JACOBIANS = {
     "vio.filters.imu_terms.accel_D_terms",
-    "vio.filters.imu_terms.gyro_D_terms",
     "vio.filters.multiview.point_D_clones",
     "vio.filters.navigation.rate_D_error",
     "vio.filters.navigation.tilt_D_terms",

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from vio.filters.imu_terms import accel_D_terms, gyro_D_terms
+from vio.filters.imu_terms import ENTRIES, IMU_TERMS, accel_D_terms
 from vio.filters.multiview import CAUCHY, MIN_DEPTH, MIN_DISPARITY_PX, TrackInformation
 from vio.filters.track_records import InverseDepth, Residuals, Views
 from vio.frontend.align import FLAT_RMS, Templates, disc, offsets, window
 from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
-from vio.records import BoolArray, IntArray
+from vio.records import BoolArray, IntArray, imu_matrices
 
 PRIOR = 1e-6  # per px^2, on a disparity: that of `vio.filters.multiview`
 ROW_WEIGHT = (4.0 / 0.3) ** 2  # gray levels and pixels: those of `frontend.align`
@@ -568,6 +568,21 @@ def integrated(
         for s, M in zip(variance, (moved[:, :, 3:], moved[:, :, :3]), strict=True)
     ]
     return R, p, v, np.einsum("kij,k->ij", moved, dt), np.array(Q)
+
+
+def calibrated(readings: FloatArray, terms: FloatArray) -> FloatArray:
+    """Readings (K, 6) `[gyro, accel]` with scale and misalignment taken out, (A1)."""
+    M_accel, M_gyro = imu_matrices(terms)
+    return np.concatenate([readings[:, :3] @ M_gyro.T, readings[:, 3:] @ M_accel.T], axis=1)
+
+
+def gyro_D_terms(gyro: FloatArray) -> FloatArray:
+    """Jacobian (..., 3, 15) of the calibrated gyro by the terms, at readings (..., 3), (A2)."""
+    sensor, row, column = ENTRIES.T
+    own = np.flatnonzero(sensor == 1)
+    out = np.zeros((*gyro.shape, IMU_TERMS))
+    out[..., row[own], own] = gyro[..., column[own]]
+    return out
 
 
 def term_columns(

@@ -15,6 +15,7 @@ from tests.filters.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from tests.filters.test_navigation import MOVING as WITHOUT_TERMS
 from tests.filters.test_online_calibration import Shaking, fly_with
 from tests.jacobians import numeric_jacobian
+from tests.numpy_twins import gyro_D_terms
 from vio.cli.running import _calibration_rows
 from vio.config import Config
 from vio.errors import ConfigError
@@ -24,7 +25,6 @@ from vio.filters.imu_terms import (
     IMU_TERMS,
     accel_D_terms,
     chosen_terms,
-    gyro_D_terms,
     significant,
 )
 from vio.filters.mono_msckf import MonoMsckf

@@ -21,7 +21,7 @@ from vio.cameras.projection import camera_args
 from vio.cameras.rectification_error import ErrorColumns
 from vio.datasets import png_rows
 from vio.filters import gate_loops, multiview, pose_loops, stereo_calibration, track_loops
-from vio.filters.imu_terms import ENTRIES, calibrated, gyro_D_terms
+from vio.filters.imu_terms import ENTRIES
 from vio.filters.landmark_gate import leave_one_out_nis
 from vio.filters.track_records import (
     ErrorRows,
@@ -495,12 +495,12 @@ def test_readings_are_calibrated_as_in_numpy() -> None:
     terms = rng.normal(0.0, 0.1, len(ENTRIES))
     found = np.empty_like(raw)
     pose_loops.calibrate(raw, ENTRIES, terms, found)
-    np.testing.assert_allclose(found, calibrated(raw, terms), rtol=1e-13)
+    np.testing.assert_allclose(found, numpy_twins.calibrated(raw, terms), rtol=1e-13)
     M_gyro = imu_matrices(terms)[1]
     D = np.empty((3, len(ENTRIES)))
     pose_loops.write_terms_of_rate(M_gyro, raw[0, :3], ENTRIES, D)
     np.testing.assert_allclose(
-        D, gyro_D_terms(np.linalg.solve(M_gyro, raw[0, :3])), rtol=1e-12, atol=1e-14
+        D, numpy_twins.gyro_D_terms(np.linalg.solve(M_gyro, raw[0, :3])), rtol=1e-12, atol=1e-14
     )
 
 

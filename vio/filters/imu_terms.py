@@ -15,10 +15,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from vio.filters.pose_loops import shrink_to_signal
+from vio.filters.pose_loops import calibrate, shrink_to_signal
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, so3_hat
-from vio.records import IMU_ENTRIES, IntArray, imu_matrices
+from vio.records import IMU_ENTRIES, IntArray
 
 ImuTerms = Literal["off", "scale", "full"]
 IMU_TERMS = len(IMU_ENTRIES)
@@ -49,6 +49,7 @@ class _TermPriors(NamedTuple):
 _PRIORS = _TermPriors()
 ENTRIES: IntArray = np.array(IMU_ENTRIES)  # (15, 3) sensor, row and column of each
 _SENSOR, _ROW, _COLUMN = ENTRIES.T
+_ACCEL = np.flatnonzero(_SENSOR == 0)
 # Random walk of the terms per root second, over their initial standard deviation: by their data
 # sheets, consumer accelerometers and gyros change by 0.02 to 0.03 % a degree, so two degrees in a
 # hundred seconds are 0.05 %.
@@ -81,25 +82,21 @@ def term_sigmas() -> FloatArray:
 
 
 def calibrated(readings: FloatArray, terms: FloatArray) -> FloatArray:
-    """Return readings (..., 6) `[gyro, accel]` with scale and misalignment taken out, equation
+    """Return readings (K, 6) `[gyro, accel]` with scale and misalignment taken out, equation
     (A1).
     """
-    M_accel, M_gyro = imu_matrices(terms)
-    return np.concatenate([readings[..., :3] @ M_gyro.T, readings[..., 3:] @ M_accel.T], axis=-1)
+    out = np.empty_like(readings)
+    calibrate(readings, ENTRIES, terms, out)
+    return out
 
 
 def accel_D_terms(accel: FloatArray) -> FloatArray:
     """Jacobian (..., 3, 15) of the calibrated accelerometer by the terms, at readings (..., 3):
     equation (A2).
     """
-    return _sensor_D_terms(accel, 0)
-
-
-def gyro_D_terms(gyro: FloatArray) -> FloatArray:
-    """Jacobian (..., 3, 15) of the calibrated gyro by the terms, at readings (..., 3): equation
-    (A2).
-    """
-    return _sensor_D_terms(gyro, 1)
+    out = np.zeros((*accel.shape, IMU_TERMS))
+    out[..., _ROW[_ACCEL], _ACCEL] = accel[..., _COLUMN[_ACCEL]]
+    return out
 
 
 def usual_reading(before: FloatArray | None, readings: FloatArray, seconds: float) -> FloatArray:
@@ -142,11 +139,4 @@ def tilt_columns(T_world_imu: FloatArray, gravity: FloatArray) -> FloatArray:
     out: FloatArray = (
         so3_hat(gravity) @ R @ accel_D_terms(-R.T @ gravity) / float(gravity @ gravity)
     )
-    return out
-
-
-def _sensor_D_terms(reading: FloatArray, sensor: int) -> FloatArray:
-    out = np.zeros((*reading.shape, IMU_TERMS))
-    own = np.flatnonzero(sensor == _SENSOR)
-    out[..., _ROW[own], own] = reading[..., _COLUMN[own]]
     return out

@@ -233,7 +233,7 @@ class MonoMsckf(Msckf):
 
 def _for_one_camera(settings: MsckfSettings) -> MsckfSettings:
     clones = max(settings.clones, _MIN_CLONES)
-    # Time offset and the accelerometer's scale trade against the scale, which rests on the IMU alone.
+    # Time offset and the accelerometer's scale trade against the scale, which the IMU alone gives.
     calibrate = "none" if settings.calibrate_camera_imu == "auto" else settings.calibrate_camera_imu
     return replace(
         settings,

@@ -24,6 +24,7 @@ from vio.filters.imu_start import imu_start
 from vio.filters.imu_terms import (
     ENTRIES,
     IMU_TERMS,
+    calibrated,
     chosen_terms,
     significant,
     tilt_columns,
@@ -286,8 +287,7 @@ class ImuMotion:
         terms = _NO_COLUMNS
         Phi_imu = None
         if len(self._chosen):
-            readings = np.empty_like(raw)
-            loops.calibrate(raw, ENTRIES, nav.imu_terms, readings)
+            readings = calibrated(raw, nav.imu_terms)
             if self._usual is None:
                 levers = raw
             else:
@@ -321,7 +321,7 @@ class ImuMotion:
         return out
 
     def _rate_D_terms(self, nav: NavState, rate: FloatArray) -> FloatArray:
-        """How a calibrated rate (3,), bias included, moves with the estimated terms (3, I): (A2)."""
+        """How a calibrated rate (3,), with its bias, moves with the estimated terms (3, I): (A2)."""
         out = np.empty((3, len(self._entries)))
         loops.write_terms_of_rate(imu_matrices(nav.imu_terms)[1], rate, self._entries, out)
         return out
