@@ -85,8 +85,8 @@ def test_a_misread_sample_is_the_perfect_one_to_the_filter_that_knows_the_terms(
     assert 0 < np.abs(walked[-1] - off.imu).max() < 1e-4
     perfect = Flight().imu(range(-100, 20), np.random.default_rng(0), QUIET)[0][40]
     read = _misread(perfect, walked[40])
-    got = calibrated(np.concatenate([read.gyro, read.accel]), walked[40])
-    np.testing.assert_allclose(got, np.concatenate([perfect.gyro, perfect.accel]), atol=1e-12)
+    got = calibrated(np.concatenate([read.gyro, read.accel])[None], walked[40])
+    np.testing.assert_allclose(got[0], np.concatenate([perfect.gyro, perfect.accel]), atol=1e-12)
     assert np.abs(read.accel - perfect.accel).max() > 0.05
 
 
