@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 
 from tests.filters.test_msckf import EXACT_RIG, STEP_NS, Flight
-from vio.filters.imu_jump import GyroJump, _common_turn, turn_of_images
+from vio.filters.imu_jump import (
+    GyroJump,
+    _common_turn,
+    motion_of_images,
+)
 from vio.filters.msckf import Msckf
 from vio.filters.noise import StepErrors
 from vio.filters.track_records import Residuals
@@ -33,11 +37,16 @@ class _Noted(Msckf):
 
 
 class _Shaken(Flight):
-    """A flight whose gyro is off by a bias (3,) from a frame on, up to another one."""
+    """A flight whose gyro is off by a bias (3,), and its accelerometer by a push (3,), from a
+    frame on, up to another one.
+    """
 
-    def __init__(self, bias: FloatArray, *, last: int = FRAMES) -> None:
+    def __init__(
+        self, bias: FloatArray, *, push: FloatArray | None = None, last: int = FRAMES
+    ) -> None:
         super().__init__(frames=FRAMES)
         self.bias = bias
+        self.push = np.zeros(3) if push is None else push
         self.last = last
 
     def imu(self, noise: np.random.Generator, bias: FloatArray) -> list[ImuSample]:
@@ -45,7 +54,9 @@ class _Shaken(Flight):
         first_ns = round((JUMP_FRAME - 0.4) * STEP_NS)
         last_ns = round((self.last - 0.4) * STEP_NS)
         return [
-            replace(x, gyro=x.gyro + self.bias) if first_ns <= x.time_ns < last_ns else x
+            replace(x, gyro=x.gyro + self.bias, accel=x.accel + self.push)
+            if first_ns <= x.time_ns < last_ns
+            else x
             for x in super().imu(noise, bias)
         ]
 
@@ -74,24 +85,33 @@ def test_a_gyro_that_stays_right_is_not_named() -> None:
     assert not any(filt.jumps)
 
 
+def _asked(off: list[bool]) -> list[bool]:
+    """Whether a gyro is asked in each step, if the images contradicted it, after steps that were
+    off or not.
+    """
+    jump = GyroJump()
+    asked = []
+    for each in off:
+        asked.append(jump.is_asked(9.0))
+        jump.take(off=each, innovation_ratio=None)
+    return asked
+
+
 def test_steps_that_were_off_before_make_no_jump() -> None:
     """Axes, a scale or a clock that are wrong contradict the images in every turn."""
-    jump = GyroJump()
-    assert not any(jump.is_settled(off=False) for _ in range(30))  # the start learns the bias
-    assert jump.is_settled(off=False)
+    asked = _asked([False] * 31 + [True] * 4)
+    assert not any(asked[:31])  # the start learns the bias
     # the first steps of a jump are off themselves
-    assert all(jump.is_settled(off=True) for _ in range(4))
-    wrong = GyroJump()
-    assert not any([wrong.is_settled(off=k % 3 == 0) for k in range(90)][40:])
+    assert all(asked[31:])
+    assert not any(_asked([k % 3 == 0 for k in range(90)])[41:])
 
 
 def test_few_steps_that_were_off_are_soon_forgotten() -> None:
     """More than three of the twenty steps before the newest three make the gyro a wrong one."""
-    jump = GyroJump()
-    settled = [jump.is_settled(off=40 <= k < 44) for k in range(66)]
-    assert all(settled[30:46])  # only three of the four are older than the newest
-    assert not any(settled[46:63])
-    assert all(settled[63:])
+    asked = _asked([40 <= k < 44 for k in range(66)])
+    assert all(asked[31:47])  # only three of the four are older than the newest
+    assert not any(asked[47:64])
+    assert all(asked[64:])
 
 
 class _Turned(Flight):
@@ -109,30 +129,49 @@ def test_a_gyro_that_is_turned_has_not_jumped() -> None:
     assert not any(filt.jumps)
 
 
-def test_a_shock_of_two_frames_leaves_the_bias_where_it_was() -> None:
-    flight = _Shaken(np.array([0.3, 0.2, -0.2]), last=JUMP_FRAME + 2)
-    errors, _, filt = flight.run(SETTINGS, "imu", sigma=0.2, limit=120, filter_class=_Noted)
-    np.testing.assert_allclose(filt.estimate().gyro_bias, 0.0, atol=0.02)
-    assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.1
+SHOCK = np.array([0.6, -0.64, 0.48])
 
 
-def _tracks(turn: FloatArray, moving: FloatArray, *, views: int = 6) -> LinearTracks:
-    """Tracks of a camera at the origin whose newest pixels are off by a rotation, and some of them
-    (N,) by a motion of their own, pixels.
+@pytest.mark.parametrize(
+    ("gyro_radps", "accel_mps2", "frames"),
+    [(2.0, 0.0, 1), (2.0, 40.0, 1), (1.5, 0.0, 4), (0.0, 60.0, 1), (0.4, 0.0, 2)],
+)
+def test_a_shock_costs_neither_the_pose_nor_the_bias(
+    gyro_radps: float, accel_mps2: float, frames: int
+) -> None:
+    """The images measure the steps that the IMU does not."""
+    quiet, _, clean = Flight(frames=FRAMES).run(SETTINGS, "imu", sigma=0.2, limit=120)
+    flight = _Shaken(
+        gyro_radps * SHOCK, push=accel_mps2 * np.array([0.8, 0.0, -0.6]), last=JUMP_FRAME + frames
+    )
+    errors, covariances, filt = flight.run(SETTINGS, "imu", sigma=0.2, limit=120)
+    error_m = np.linalg.norm(errors[JUMP_FRAME:, :3], axis=1)
+    sigma_m = np.sqrt(np.trace(covariances[JUMP_FRAME:, :3, :3], axis1=1, axis2=2))
+    assert (error_m < 3 * sigma_m).all()
+    assert error_m.max() < 2 * np.linalg.norm(quiet[JUMP_FRAME:, :3], axis=1).max()
+    np.testing.assert_allclose(filt.estimate().gyro_bias, clean.estimate().gyro_bias, atol=0.001)
+
+
+def _tracks(
+    turn: FloatArray, moving: FloatArray, *, shift: FloatArray | None = None, views: int = 6
+) -> LinearTracks:
+    """Tracks of a camera at the origin whose newest pixels are off by a rotation and a shift, and
+    some of them (N,) by a motion of their own, pixels.
     """
     rng = np.random.default_rng(3)
     count = len(moving)
     p = np.column_stack([rng.uniform(-3, 3, (count, 2)), rng.uniform(4, 9, count)])
     f = 400.0
     J = np.zeros((count, views, 4, 3))
-    for row, shift in ((0, 0.0), (2, 0.1)):
-        x = p[:, 0] - shift
+    for row, baseline_m in ((0, 0.0), (2, 0.1)):
+        x = p[:, 0] - baseline_m
         J[:, :, row, 0] = (f / p[:, 2])[:, None]
         J[:, :, row, 2] = (-f * x / p[:, 2] ** 2)[:, None]
         J[:, :, row + 1, 1] = (f / p[:, 2])[:, None]
         J[:, :, row + 1, 2] = (-f * p[:, 1] / p[:, 2] ** 2)[:, None]
     r = rng.normal(0, 0.2, (count, views, 4))
-    r[:, -1] += np.einsum("fki,fi->fk", J[:, -1], np.cross(turn, p))
+    moved = np.cross(turn, p) + (0.0 if shift is None else shift)
+    r[:, -1] += np.einsum("fki,fi->fk", J[:, -1], moved)
     r[:, -1, [0, 2]] += moving[:, None]
     at = Residuals(r, J, np.ones(count, dtype=np.bool_), np.ones((count, views, 4)))
     T = np.broadcast_to(np.eye(4), (views, 4, 4)).copy()
@@ -145,33 +184,50 @@ MOVED = np.diag([1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4]) ** 2
 
 
 def test_one_rotation_of_all_old_tracks_is_found() -> None:
-    found = turn_of_images(_tracks(TURN, np.zeros(60)), MOVED, np.eye(4))
+    found = motion_of_images(_tracks(TURN, np.zeros(60)), MOVED, np.eye(4))
     assert found is not None
-    np.testing.assert_allclose(np.abs(found), np.abs(TURN), atol=3e-4)
+    assert found.shift is None
+    np.testing.assert_allclose(np.abs(found.turn), np.abs(TURN), atol=3e-4)
+
+
+def test_a_shift_beside_it_is_found_however_little_it_was_expected() -> None:
+    """Fifty standard deviations; held to what was predicted, it would pass for a rotation."""
+    shift = np.array([0.05, -0.03, 0.02])
+    found = motion_of_images(_tracks(TURN, np.zeros(60), shift=shift), MOVED, np.eye(4))
+    assert found is not None
+    assert found.shift is not None
+    np.testing.assert_allclose(np.abs(found.shift[:2]), np.abs(shift[:2]), atol=3e-3)
+    np.testing.assert_allclose(np.abs(found.turn), np.abs(TURN), atol=6e-4)
+
+
+def test_a_shift_alone_is_no_rotation() -> None:
+    """A push on the accelerometer."""
+    pushed = _tracks(np.zeros(3), np.zeros(60), shift=np.array([0.05, -0.03, 0.02]))
+    assert motion_of_images(pushed, MOVED, np.eye(4)) is None
 
 
 @pytest.mark.parametrize(("count", "found"), [(14, False), (15, True)])
 def test_a_few_tracks_prove_no_rotation(count: int, found: bool) -> None:
-    turn = turn_of_images(_tracks(TURN, np.zeros(count)), MOVED, np.eye(4))
+    turn = motion_of_images(_tracks(TURN, np.zeros(count)), MOVED, np.eye(4))
     assert (turn is not None) == found
 
 
 @pytest.mark.parametrize(("moving", "found"), [(16, True), (24, False)])
 def test_four_fifths_of_the_tracks_must_agree_on_a_rotation(moving: int, found: bool) -> None:
     off = np.where(np.arange(100) < moving, 6.0, 0.0)
-    assert (turn_of_images(_tracks(TURN, off), MOVED, np.eye(4)) is not None) == found
+    assert (motion_of_images(_tracks(TURN, off), MOVED, np.eye(4)) is not None) == found
 
 
 def test_things_that_move_are_no_rotation() -> None:
     moving = np.where(np.arange(60) < 25, 6.0, 0.0)
-    assert turn_of_images(_tracks(np.zeros(3), moving), MOVED, np.eye(4)) is None
+    assert motion_of_images(_tracks(np.zeros(3), moving), MOVED, np.eye(4)) is None
 
 
 def test_what_has_just_come_into_view_is_not_asked() -> None:
     """A track is old once four views before the newest one have seen it."""
     young = _tracks(TURN, np.zeros(60), views=4)
-    assert turn_of_images(young, MOVED, np.eye(4)) is None
-    assert turn_of_images(_tracks(TURN, np.zeros(60), views=5), MOVED, np.eye(4)) is not None
+    assert motion_of_images(young, MOVED, np.eye(4)) is None
+    assert motion_of_images(_tracks(TURN, np.zeros(60), views=5), MOVED, np.eye(4)) is not None
 
 
 def test_a_bias_that_comes_back_has_not_jumped() -> None:

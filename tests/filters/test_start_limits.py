@@ -15,12 +15,12 @@ import pytest
 from tests.filters.test_msckf import CAMERA, T_CAM0_IMU
 from vio.errors import DivergedError
 from vio.filters.alignment import Bearings, FreeMotion, gyro_bias
-from vio.filters.imu_jump import GyroJump, turn_of_images
+from vio.filters.imu_jump import Contradiction, GyroJump, motion_of_images
 from vio.filters.landmark_gate import LandmarkGate
 from vio.filters.mono_start import MonoStarter, _disagreement, is_still
 from vio.filters.msckf import _check_sane
 from vio.filters.multiview import residuals, usable_points
-from vio.filters.navigation import ImuMotion, NavState
+from vio.filters.navigation import Growth, ImuMotion, NavState
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.settings import MsckfSettings, VislamSettings
 from vio.filters.step_by_images import explained_share, is_lost, linked_points, step_by_images
@@ -180,14 +180,16 @@ START: dict[str, tuple[Says, float, float]] = {
 # A gyro that jumps
 
 
+def _asked(off: list[bool], ratio: float = 9.0) -> bool:
+    """Whether a gyro is asked that the images contradict, after steps that were off or not."""
+    jump = GyroJump()
+    for each in off:
+        jump.take(off=each, innovation_ratio=None)
+    return jump.is_asked(ratio)
+
+
 def _settled(off: list[bool]) -> bool:
-    jump = GyroJump()
-    return [jump.is_settled(off=each) for each in [False] * 40 + off][-1]
-
-
-def _begun(steps: int) -> bool:
-    jump = GyroJump()
-    return [jump.is_settled(off=False) for _ in range(steps)][-1]
+    return _asked([False] * 40 + off)
 
 
 def _changed(sigmas: float) -> bool:
@@ -204,28 +206,53 @@ def _repeats(less: float) -> bool:
     return jump.repeats((1.0 - less) * rate)
 
 
-def _turn(tracks: int = 60, views: int = 6, agreeing: float = 1.0) -> bool:
-    """Whether tracks of some views show a rotation, which a share of them follows."""
+def _turn(tracks: int = 60, views: int = 6, agreeing: float = 1.0, sigmas: float = 200.0) -> bool:
+    """Whether tracks of some views show a rotation of so many standard deviations, which a share
+    of them follows.
+    """
     rng = np.random.default_rng(0)
     p = rng.uniform([-2.0, -1.0, 3.0], [2.0, 1.0, 6.0], (tracks, 3))
     J = np.zeros((tracks, 9, 4, 3))
     J[:, 9 - views :] = z_D_p_cam(CAMERA, p)[:, None]
     r = np.zeros((tracks, 9, 4))
-    r[:, -1] = np.einsum("fki,fi->fk", J[:, -1], np.cross([0.0, 0.02, 0.0], p))
+    r[:, -1] = np.einsum("fki,fi->fk", J[:, -1], np.cross([0.0, 1e-4 * sigmas, 0.0], p))
     wrong = round((1.0 - agreeing) * tracks)
     r[:wrong, -1] += rng.choice([-60.0, 60.0], (wrong, 4))
     at = Residuals(r, J, np.ones(tracks, np.bool_), np.ones(r.shape))
-    predicted: Any = SimpleNamespace(at=at, p_world=p, variance=0.01)
-    return turn_of_images(predicted, 1e-8 * np.eye(6), np.eye(4)) is not None
+    predicted: Any = SimpleNamespace(at=at, p_world=p, variance=1e-4)
+    return motion_of_images(predicted, 1e-8 * np.eye(6), np.eye(4)) is not None
+
+
+def _doubts_bias(radps: float) -> bool:
+    """Whether a rate by which images contradict a gyro in two steps makes its bias uncertain."""
+    lacking: list[FloatArray] = []
+    window: Any = SimpleNamespace(
+        last_step_s=0.05,
+        nav=SimpleNamespace(gyro_bias=np.zeros(3)),
+        prior=SimpleNamespace(P=np.eye(15)),
+        move_newest=lambda turn, shift: None,
+        inflate_process_noise=lacking.append,
+    )
+    noise = np.zeros((2, 15, 15))
+    noise[1, 3:6, 3:6] = np.eye(3)
+    shown = Contradiction(np.array([0.05 * radps, 0.0, 0.0]), None)
+    jump = GyroJump()
+    for _ in range(2):
+        jump.doubt_step(
+            window, shown, Growth(np.eye(15), noise.sum(axis=0), noise, False, np.eye(15))
+        )
+    return bool(lacking[-1][9:12, 9:12].any())
 
 
 JUMP: dict[str, tuple[Says, float, float]] = {
-    "start": (lambda n: _begun(int(n)), 30, 31),
+    "start": (lambda n: _asked([False] * int(n)), 30, 31),
     "steps that are off": (lambda n: not _settled([True] * int(n) + [False] * 3), 3, 4),
     "newest steps": (lambda n: not _settled([True] * int(n)), 6, 7),
     "quiet steps": (lambda n: _settled([True] * 4 + [False] * int(n)), 19, 20),
-    "innovations": (lambda x: GyroJump().is_contradicted(x), 1.7, 2.3),
+    "innovations": (lambda x: _asked([False] * 40, x), 1.2, 1.6),
+    "significance": (lambda x: _turn(sigmas=x), 8.5, 11.5),
     "bias": (_changed, 2.6, 3.4),
+    "largest bias": (lambda x: not _doubts_bias(x), 0.43, 0.57),
     "alike": (lambda x: not _repeats(x), 0.43, 0.57),
     "old views": (lambda n: _turn(views=int(n) + 1), 3, 4),
     "old tracks": (lambda n: _turn(int(n)), 14, 15),

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.cameras.rectification_error import CONSIDERED
-from vio.filters.imu_jump import GyroJump
+from vio.filters.imu_jump import GyroJump, motion_of_images
 from vio.filters.landmark_gate import LandmarkGate
 from vio.filters.new_landmarks import NewLandmarks
 from vio.filters.noise import StepErrors
@@ -115,27 +115,19 @@ class FrameUpdate:
         innovation = tracks.newest_innovation()
         innovation_ratio = self.fit.tracks.innovation_ratio(tracks, expected)
         predicted = _Predicted(tracks, T_world_imu, expected, innovation, innovation_ratio)
+        is_shocked = self._take_shock(window, predicted)
+        if is_shocked:
+            tracks = self.fit.linearise(window, tracks.rows)
         tracks, fitted = self.fit.fit(window, tracks, pixels, innovation)
         step = self._step_errors(window, tracks, motion, fitted, expected)
         jump_radps = None
         if step is not None:
             missing = step.missing_noise()
-            turn = self._gyro_jump.turn(
-                predicted.tracks,
-                predicted.covariance,
-                predicted.T_world_imu,
-                off=bool(missing[1]) or self._gyro_jump.is_contradicted(innovation_ratio),
-                measured=self._has_imu,
-            )
-            if turn is None:
+            self._gyro_jump.take(off=bool(missing[1]), innovation_ratio=innovation_ratio)
+            if not is_shocked:
                 jump_radps = self._gyro_jump.agrees(window.nav.gyro_bias)
-            trusted = True
-            if turn is not None and self._gyro_jump.doubts(
-                window, turn, propagation.since_frame, lambda: self.fit.tracks.agree(tracks.at)
-            ):
-                trusted = False
-                tracks, fitted = self.fit.fit(window, tracks, pixels, innovation)
-            elif missing.any():
+            trusted = not is_shocked
+            if trusted and missing.any():
                 first = _Fitted(tracks, fitted, pixels, trusted)
                 again = self._fit_without_prediction(window, first, predicted, missing)
                 tracks, fitted, pixels, trusted = again
@@ -171,6 +163,18 @@ class FrameUpdate:
             gyro_jump_radps=jump_radps,
             scale_doubt=self._rig.scale_doubt(window),
         )
+
+    def _take_shock(self, window: Window, predicted: _Predicted) -> bool:
+        """Move the newest pose to where the images show it, and make it uncertain by as much,
+        where they contradict an IMU that agreed before; return whether they do.
+        """
+        if not self._has_imu or not self._gyro_jump.is_asked(predicted.innovation_ratio):
+            return False
+        shown = motion_of_images(predicted.tracks, predicted.covariance, predicted.T_world_imu)
+        if shown is None:
+            return False
+        self._gyro_jump.doubt_step(window, shown, self._propagation.since_frame)
+        return True
 
     def _take_pixels(self, window: Window, seen: Observations) -> Views:
         """Give the tracks what a frame shows of them; return what it shows of the landmarks, of

@@ -1,23 +1,22 @@
-"""A gyro whose bias jumps: the images show another rotation than it does, the same one in all old
-tracks.
+"""An IMU that is shocked, or whose gyro's bias jumps: the images show another motion than it does,
+the same one in all old tracks.
 
 A scene that stands still, seen by a body whose gyro is wrong, is off by one rotation in all its
-tracks, while the translation stays as predicted. Things that move by themselves contradict the rest
-of the scene, and what comes into view is not old. Where one rotation explains nearly all old
-tracks, the gyro's bias and this step's rotation become uncertain by its size, and the images
-estimate both anew: equation (N15) of docs/math.md.
+tracks; a shock may move it, too. Things that move by themselves contradict the rest of the scene,
+and what comes into view is not old. Where one motion explains nearly all old tracks, the newest
+pose takes it and becomes uncertain by its size; where the rate repeats, the gyro's bias does, too.
+The images estimate both anew: equation (N15) of docs/math.md.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from vio.filters.multiview import CAUCHY
-from vio.filters.navigation import Growth, NavState
+from vio.filters.navigation import Growth
 from vio.filters.noise import (
     ROTATION,
     SLIGHTLY_INFORMED,
@@ -34,16 +33,24 @@ from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray
 
 
-class _RotationRules(NamedTuple):
-    """The rotation that old tracks show."""
+class _MotionRules(NamedTuple):
+    """The motion that old tracks show."""
 
     min_old_views: int = 4  # of a track before the newest: what it shows has been part of the scene
     min_old_tracks: int = 15
-    min_agreeing_share: float = 0.8  # share of the old tracks that one rotation must explain
+    min_agreeing_share: float = 0.8  # share of the old tracks that one motion must explain
+    # information of a translation that may be off, over what it has as predicted: a thousand
+    # times its standard deviation
+    weight_of_unknown: float = 1e-6
+    # from what was predicted; renders along real flights whose gyro is right come to 8, half a
+    # step of one that has jumped by 0.05 rad/s to 12
+    sigmas: float = 10.0
     steps: Tolerance[int] = 8  # of the robust fit
 
 
-_ROTATION = _RotationRules()
+_MOTION = _MotionRules()
+
+MAX_GYRO_BIAS_RADPS = 0.5  # no sensor that works has more
 
 
 class _JumpRules(NamedTuple):
@@ -58,7 +65,7 @@ class _JumpRules(NamedTuple):
     newest_steps: int = 3
     max_off_steps: int = 3
     # innovations over their standard deviation (median): more, and the gyro may have jumped
-    innovation_sigmas: float = 2.0
+    innovation_sigmas: float = 1.4
     changed_sigmas: float = 3.0  # of the bias before: less is no jump
     # of the larger one: rates of two steps that differ by less are one jump
     alike_share: float = 0.5
@@ -93,13 +100,20 @@ _LASTING = _LastingRules()
 _LASTING_LIMIT = chi_square_quantile(_LASTING.probability, np.arange(1, 4)).tolist()
 
 
-def turn_of_images(
-    predicted: LinearTracks, moved: FloatArray, T_world_imu: FloatArray
-) -> FloatArray | None:
-    """Fit the rotation (3,) of the body, world frame, by which the newest pixels of old tracks
-    differ from the predicted ones.
+class Contradiction(NamedTuple):
+    """The motion of the body, world frame, by which images contradict a predicted step."""
 
-    None: it is within what was predicted, or no single one explains nearly all of them.
+    turn: FloatArray  # (3,) rad
+    shift: FloatArray | None  # (3,) m; None: the translation is as predicted
+
+
+def motion_of_images(
+    predicted: LinearTracks, moved: FloatArray, T_world_imu: FloatArray
+) -> Contradiction | None:
+    """Fit the motion of the body by which the newest pixels of old tracks differ from the
+    predicted ones.
+
+    None: its rotation is within what was predicted, or no single one explains nearly all of them.
 
     Args:
         predicted: tracks linearised where the motion model has the newest clone.
@@ -108,7 +122,7 @@ def turn_of_images(
         T_world_imu: (4, 4) the body's pose there.
     """
     old = _is_old(predicted.at)
-    if int(old.sum()) < _ROTATION.min_old_tracks:
+    if int(old.sum()) < _MOTION.min_old_tracks:
         return None
     p_body = T_world_imu[:3, 3]
     J = predicted.at.z_D_p[old, -1]
@@ -118,39 +132,57 @@ def turn_of_images(
     about_body = np.eye(6)
     about_body[:3, 3:] = -so3_hat(p_body)
     expected = about_body @ moved @ about_body.T
-    information = np.zeros((6, 6))  # of the translation alone: the gyro is in question
-    information[:3, :3] = np.linalg.inv(expected[:3, :3])
-    motion, P, left = _robust_fit(B, r, information, predicted.variance)
-    turn: FloatArray = motion[3:]
-    squared = float(turn @ np.linalg.solve(expected[3:, 3:] + P[3:, 3:], turn))
-    if squared < chi_square_table(VIEW_PROBABILITY)[3]:
+    variance = predicted.variance
+    of_shift = np.zeros((6, 6))
+    of_shift[:3, :3] = np.linalg.inv(expected[:3, :3])
+    shift: FloatArray | None = None
+    motion, P, left = _robust_fit(B, r, of_shift, variance)
+    if not _is_beyond(motion[3:], expected[3:, 3:] + P[3:, 3:]):
         return None
+    # it may be the translation instead that is not as predicted, or both
+    free, P, free_left = _robust_fit(B, r, _MOTION.weight_of_unknown * of_shift, variance)
+    if _is_beyond(free[:3], expected[:3, :3] + P[:3, :3]):
+        shift = free[:3]
+        motion = free
+        left = free_left
+        if not _is_beyond(motion[3:], expected[3:, 3:] + P[3:, 3:]):
+            return None
     pixels = np.any(J != 0.0, axis=2).sum(axis=1)
-    limits = predicted.variance * chi_square_table(VIEW_PROBABILITY)[pixels]
-    if np.mean(np.sum(left**2, axis=1) < limits) <= _ROTATION.min_agreeing_share:
+    limits = variance * chi_square_table(VIEW_PROBABILITY)[pixels]
+    if np.mean(np.sum(left**2, axis=1) < limits) <= _MOTION.min_agreeing_share:
         return None
-    return turn
+    return Contradiction(motion[3:], shift)
 
 
-def _gyro_doubt(growth: Growth, nav: NavState, turn: FloatArray, seconds: float) -> FloatArray:
-    """Return the covariance (15, 15) that a navigation state lacks after a step over which the
-    gyro was off by a rotation (3,): that of a bias of this size, and of such a rotation alone.
+def _is_beyond(error: FloatArray, covariance: FloatArray) -> bool:
+    """Whether an error (3,) is beyond its covariance (3, 3) by far."""
+    return float(error @ np.linalg.solve(covariance, error)) > _MOTION.sigmas**2
 
-    Args:
-        growth: of the state's error over the step.
-        nav: the state after it.
-        turn: the rotation, rad.
-        seconds: length of the step.
+
+def _noise_of(growth: Growth, motion: FloatArray, part: int) -> FloatArray:
+    """Return the covariance (15, 15) that a step lacks in which noise of the accelerometer (part
+    0) or of the gyro (1) made a shift or a rotation (3,).
     """
-    size = float(np.linalg.norm(turn))
-    by_bias = growth.Phi[:, 9:12] * (size / seconds)
-    by_turn = np.zeros((len(growth.Phi), 3))
-    by_turn[:3] = so3_hat(nav.T_world_imu[:3, 3])
-    by_turn[3:6] = np.eye(3)
-    by_turn[6:9] = so3_hat(nav.velocity)
-    by_turn *= size
-    out: FloatArray = by_bias @ by_bias.T + by_turn @ by_turn.T
+    Q = growth.Q_parts[part]
+    made = Q[3 * part : 3 * part + 3, 3 * part : 3 * part + 3]
+    out: FloatArray = Q * (motion @ motion / (np.trace(made) / 3))
     return out
+
+
+def _bias_doubt(growth: Growth, turn: FloatArray, seconds: float) -> FloatArray:
+    """Return the covariance (15, 15) that a navigation state lacks after a step with a growth of
+    its error, in which a bias made such a rotation.
+    """
+    by_bias = growth.Phi[:, 9:12] * (float(np.linalg.norm(turn)) / seconds)
+    out: FloatArray = by_bias @ by_bias.T
+    return out
+
+
+def is_contradicted(innovation_ratio: float | None) -> bool:
+    """Whether innovations over their standard deviation, median, contradict the prediction; None:
+    there are none.
+    """
+    return (innovation_ratio or 0.0) > _JUMP.innovation_sigmas
 
 
 class GyroJump:
@@ -165,55 +197,37 @@ class GyroJump:
         # (3,) the bias before it was doubted, and its standard deviations then; None: it is not
         self._before: tuple[FloatArray, FloatArray] | None = None
 
-    def is_contradicted(self, innovation_ratio: float | None) -> bool:
-        """Whether innovations over their standard deviation, median, contradict the prediction;
-        None: there are none.
+    def take(self, *, off: bool, innovation_ratio: float | None) -> None:
+        """Take a step: whether its rotation was corrected by more than its noise, and its
+        innovations over their standard deviation, median; None: there are none.
         """
-        return (innovation_ratio or 0.0) > _JUMP.innovation_sigmas
+        self._steps += 1
+        self._off.append(off or is_contradicted(innovation_ratio))
 
-    def turn(
-        self,
-        predicted: LinearTracks,
-        moved: FloatArray,
-        T_world_imu: FloatArray,
-        *,
-        off: bool,
-        measured: bool,
-    ) -> FloatArray | None:
-        """Take a step; return the rotation (3,) by which the images contradict a gyro that is off.
-
-        None: they do not, or the gyro has not measured it. See `turn_of_images` for the first three
-        arguments.
-
-        Args:
-            predicted: tracks at the predicted pose.
-            moved: covariance (6, 6) of the predicted motion.
-            T_world_imu: (4, 4) predicted pose of the body.
-            off: whether the images contradict the prediction.
-            measured: whether the gyro has predicted the step.
+    def is_asked(self, innovation_ratio: float | None) -> bool:
+        """Whether innovations contradict the prediction, after a start that learns bias and tilt
+        and steps that agreed.
         """
-        settled = self.is_settled(off=off)
-        if not off or not measured or not settled:
-            return None
-        return turn_of_images(predicted, moved, T_world_imu)
+        return is_contradicted(innovation_ratio) and self._settled
 
-    def doubts(
-        self, window: Window, turn: FloatArray, growth: Growth, agree: Callable[[], bool]
-    ) -> bool:
-        """Whether the newest step contradicts the gyro by a rotation (3,) that inflated noise of
-        one step does not explain; then its bias becomes uncertain by that.
+    def doubt_step(self, window: Window, shown: Contradiction, growth: Growth) -> None:
+        """Take what the images contradict of the newest step, and make it uncertain by as much;
+        the gyro's bias, too, if they did so by the like in the step before.
 
         Args:
             window: whose newest step it is.
-            turn: the rotation, rad.
+            shown: by which motion they contradict it.
             growth: of the state's error over the step.
-            agree: whether the tracks agree with one another after a fit.
         """
         seconds = window.last_step_s
-        if not self.repeats(turn / seconds) and agree():
-            return False
-        self._doubt_gyro(window, turn, growth, seconds)
-        return True
+        rate = shown.turn / seconds
+        window.move_newest(shown.turn, np.zeros(3) if shown.shift is None else shown.shift)
+        if shown.shift is not None:
+            window.inflate_process_noise(_noise_of(growth, shown.shift, 0))
+        if self.repeats(rate) and float(np.linalg.norm(rate)) <= MAX_GYRO_BIAS_RADPS:
+            self._doubt_gyro(window, shown.turn, growth, seconds)
+        else:
+            window.inflate_process_noise(_noise_of(growth, shown.turn, 1))
 
     def doubts_lasting(self, window: Window, step: StepErrors, growth: Growth) -> bool:
         """Take the correction of a step that the images do not contradict; return whether they
@@ -242,15 +256,8 @@ class GyroJump:
     def _doubt_gyro(self, window: Window, turn: FloatArray, growth: Growth, seconds: float) -> None:
         """Make the bias uncertain by a rotation (3,) over some seconds up to the newest step."""
         self.doubt(window.nav.gyro_bias, np.sqrt(np.diag(window.prior.P)[9:12]))
-        window.inflate_process_noise(_gyro_doubt(growth, window.nav, turn, seconds))
-
-    def is_settled(self, *, off: bool) -> bool:
-        """Take a step, and whether the images contradict it; return whether the start, which learns
-        bias and tilt, is over, and the steps before agreed.
-        """
-        self._steps += 1
-        self._off.append(off)
-        return self._settled
+        lacking = _noise_of(growth, turn, 1) + _bias_doubt(growth, turn, seconds)
+        window.inflate_process_noise(lacking)
 
     @property
     def _settled(self) -> bool:
@@ -315,7 +322,7 @@ def _common_turn(steps: list[StepErrors]) -> FloatArray | None:
 def _is_old(at: Residuals) -> BoolArray:
     """Which tracks (F,) the newest clone sees, and several before it have seen."""
     seen = np.any(at.z_D_p != 0.0, axis=(2, 3))
-    old: BoolArray = seen[:, -1] & (seen[:, :-1].sum(axis=1) >= _ROTATION.min_old_views)
+    old: BoolArray = seen[:, -1] & (seen[:, :-1].sum(axis=1) >= _MOTION.min_old_views)
     return old
 
 
@@ -328,16 +335,17 @@ def _robust_fit(
         The motion, `r = B motion + noise`, its covariance (6, 6), and the residuals left (F, 4).
     """
     width = CAUCHY * CAUCHY * variance
-    left = r
-    motion = np.zeros(6)
-    A = information
+    left: FloatArray = r
+    H = B.reshape(-1, 6)
+    z = r.ravel()
     # the first scale is that of the residuals themselves, as all of them are off together
-    scale = max(width, float(np.median(np.sum(r**2, axis=1))))
-    for _ in range(_ROTATION.steps):
-        weight = 1 / (1 + np.sum(left**2, axis=1) / scale)
-        A = np.einsum("f,fki,fkj->ij", weight, B, B) / variance + information
-        b = np.einsum("f,fki,fk->i", weight, B, r) / variance
-        motion = np.linalg.solve(A, b)
+    squared: FloatArray = np.einsum("fi,fi->f", r, r)
+    scale = max(width, float(np.median(squared)))
+    for _ in range(_MOTION.steps):
+        weighted = np.repeat(1 / (1 + squared / scale), 4)[:, None] * H / variance
+        A = weighted.T @ H + information
+        motion = np.asarray(np.linalg.solve(A, weighted.T @ z), dtype=np.float64)
         left = r - B @ motion
+        squared = np.einsum("fi,fi->f", left, left)
         scale = max(width, 0.25 * scale)
     return motion, np.asarray(np.linalg.inv(A), dtype=np.float64), left

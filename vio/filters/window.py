@@ -229,6 +229,20 @@ class Window:
         times_ns = self.clones.times_ns
         return float(times_ns[-1] - times_ns[-2]) * 1e-9
 
+    def move_newest(self, turn: FloatArray, shift: FloatArray) -> None:
+        """Turn the body by a rotation (3,) about itself and shift it by (3,), world frame, in the
+        newest clone and the navigation state; with them goes what is known of them.
+        """
+        R = so3_exp(turn)
+
+        def moved(T_world_imu: FloatArray) -> FloatArray:
+            return se3_from_parts(R @ T_world_imu[:3, :3], T_world_imu[:3, 3] + shift)
+
+        self.nav = replace(self.nav, T_world_imu=moved(self.nav.T_world_imu))
+        poses = self.clones.T_world_imu.copy()
+        poses[-1] = moved(poses[-1])
+        self.clones = replace(self.clones, T_world_imu=poses)
+
     def inflate_process_noise(self, extra: FloatArray) -> None:
         """Add noise (15, 15) to the last step, as if its motion had been known less; the newest
         clone ends it.

@@ -12,6 +12,7 @@ import numpy as np
 
 from vio.calibration.severity import rows_grade
 from vio.dataclass import dataclass
+from vio.filters.imu_jump import MAX_GYRO_BIAS_RADPS
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray, length
 from vio.numerics.robust import median
@@ -49,7 +50,6 @@ class _PossibleRules(NamedTuple):
 
     restart_event_s: float = 1.0  # restarts that follow each other within this time are one event
     max_speed_mps: float = 100.0
-    max_gyro_bias_radps: float = 0.5
     max_accel_bias_mps2: float = 3.0
     # of the clocks' offset beside that of the rates of gyro and images, beyond its sigmas
     max_offset_error_s: float = 0.02
@@ -277,7 +277,7 @@ class RunHealth:
             lines += self._once(index, "speed", speed, _POSSIBLE.max_speed_mps, line)
         self._last = estimate.time_ns, position
         for name, bias, limit, unit in (
-            ("gyro bias", estimate.gyro_bias, _POSSIBLE.max_gyro_bias_radps, "rad/s"),
+            ("gyro bias", estimate.gyro_bias, MAX_GYRO_BIAS_RADPS, "rad/s"),
             ("accelerometer bias", estimate.accel_bias, _POSSIBLE.max_accel_bias_mps2, "m/s^2"),
         ):
             if bias is not None:
