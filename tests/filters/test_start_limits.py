@@ -15,7 +15,7 @@ import pytest
 from tests.filters.test_msckf import CAMERA, T_CAM0_IMU
 from vio.errors import DivergedError
 from vio.filters.alignment import Bearings, FreeMotion, gyro_bias
-from vio.filters.imu_jump import Contradiction, GyroJump, motion_of_images
+from vio.filters.imu_jump import Contradiction, GyroJump, ShownMotion
 from vio.filters.landmark_gate import LandmarkGate
 from vio.filters.mono_start import MonoStarter, _disagreement, is_still
 from vio.filters.msckf import _check_sane
@@ -184,7 +184,7 @@ def _asked(off: list[bool], ratio: float = 9.0) -> bool:
     """Whether a gyro is asked that the images contradict, after steps that were off or not."""
     jump = GyroJump()
     for each in off:
-        jump.take(off=each, innovation_ratio=None)
+        jump.take(off=each)
     return jump.is_asked(ratio)
 
 
@@ -220,10 +220,15 @@ def _turn(tracks: int = 60, views: int = 6, agreeing: float = 1.0, sigmas: float
     r[:wrong, -1] += rng.choice([-60.0, 60.0], (wrong, 4))
     at = Residuals(r, J, np.ones(tracks, np.bool_), np.ones(r.shape))
     predicted: Any = SimpleNamespace(at=at, p_world=p, variance=1e-4)
-    return motion_of_images(predicted, 1e-8 * np.eye(6), np.eye(4)) is not None
+    nav = SimpleNamespace(T_world_imu=np.eye(4))
+    window: Any = SimpleNamespace(nav=nav, clones=None, move_newest=lambda turn, shift: None)
+    left = at._replace(r=np.where(np.abs(r) > 30.0, r, 0.0))
+    there: Any = SimpleNamespace(at=left, p_world=p, variance=1e-4)
+    motion = ShownMotion(window, 1e-8 * np.eye(6), lambda: there)
+    return motion.find(predicted) is not None
 
 
-def _doubts_bias(radps: float) -> bool:
+def _doubts_bias(radps: float, steps: int = 40) -> bool:
     """Whether a rate by which images contradict a gyro in two steps makes its bias uncertain."""
     lacking: list[FloatArray] = []
     window: Any = SimpleNamespace(
@@ -237,6 +242,8 @@ def _doubts_bias(radps: float) -> bool:
     noise[1, 3:6, 3:6] = np.eye(3)
     shown = Contradiction(np.array([0.05 * radps, 0.0, 0.0]), None)
     jump = GyroJump()
+    for _ in range(steps):
+        jump.take(off=False)
     for _ in range(2):
         jump.doubt_step(
             window, shown, Growth(np.eye(15), noise.sum(axis=0), noise, False, np.eye(15))
@@ -245,7 +252,8 @@ def _doubts_bias(radps: float) -> bool:
 
 
 JUMP: dict[str, tuple[Says, float, float]] = {
-    "start": (lambda n: _asked([False] * int(n)), 30, 31),
+    "first steps": (lambda n: _asked([False] * int(n)), 10, 11),
+    "start": (lambda n: _doubts_bias(0.1, int(n)), 30, 31),
     "steps that are off": (lambda n: not _settled([True] * int(n) + [False] * 3), 3, 4),
     "newest steps": (lambda n: not _settled([True] * int(n)), 6, 7),
     "quiet steps": (lambda n: _settled([True] * 4 + [False] * int(n)), 19, 20),

@@ -149,6 +149,18 @@ def _jump(*, gyro: bool) -> Make:
     return make
 
 
+def _shock(size: float, rng: np.random.Generator) -> Variant:
+    """A blow that both sensors feel and the body does not make, as on a mount that gives."""
+    blow = imu_readings(plus(*(size * _direction(rng))), plus(*(20 * size * _direction(rng))))
+    length_ns = round(1e9 * float(np.exp(rng.uniform(np.log(0.01), np.log(0.2)))))
+
+    def variant(dataset: Dataset, period: Period) -> Changed:
+        during = Period(period.begin_ns, period.begin_ns + length_ns)
+        return imu_samples(blow, during=True)(dataset, during)
+
+    return variant
+
+
 def _offset(*, gyro: bool) -> Make:
     def make(size: float, rng: np.random.Generator) -> Variant:
         bias = size * _direction(rng)
@@ -280,6 +292,7 @@ KINDS: dict[str, Kind] = {
     "stuck": Kind("imu", "period", 1, 1, "", _constant(stuck_samples)),
     "silent": Kind("imu", "period", 1, 1, "", _constant(gap(frames=False, samples=True))),
     "dead": Kind("imu", "onwards", 1, 1, "", _constant(_readings_after(lambda sample: None))),
+    "shock": Kind("imu", "onwards", 0.3, 6.0, "rad/s", _shock),
 }
 # Every second kind is kept aside: the two of a similar pair come to different halves.
 HALVES: dict[str, Half] = {

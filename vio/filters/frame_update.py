@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.cameras.rectification_error import CONSIDERED
-from vio.filters.imu_jump import GyroJump, motion_of_images
+from vio.filters.imu_jump import GyroJump, ShownMotion
 from vio.filters.landmark_gate import LandmarkGate
 from vio.filters.new_landmarks import NewLandmarks
 from vio.filters.noise import StepErrors
@@ -41,7 +41,6 @@ class _Predicted(NamedTuple):
     """A frame as it was predicted."""
 
     tracks: LinearTracks  # at the predicted pose
-    T_world_imu: FloatArray  # (4, 4) predicted pose of the body
     covariance: FloatArray  # (6, 6) of the camera's motion since the last frame
     innovation: float | None  # of the newest pixels, median
     innovation_ratio: float | None  # over their standard deviation, median
@@ -110,11 +109,10 @@ class FrameUpdate:
         motion = None
         if len(window.clones) > 1:
             motion = window.camera_move_since(-2)
-        T_world_imu = window.nav.T_world_imu
         tracks = self._linearise_prediction(window, pixels)
         innovation = tracks.newest_innovation()
         innovation_ratio = self.fit.tracks.innovation_ratio(tracks, expected)
-        predicted = _Predicted(tracks, T_world_imu, expected, innovation, innovation_ratio)
+        predicted = _Predicted(tracks, expected, innovation, innovation_ratio)
         is_shocked = self._take_shock(window, predicted)
         if is_shocked:
             tracks = self.fit.linearise(window, tracks.rows)
@@ -123,7 +121,7 @@ class FrameUpdate:
         jump_radps = None
         if step is not None:
             missing = step.missing_noise()
-            self._gyro_jump.take(off=bool(missing[1]), innovation_ratio=innovation_ratio)
+            self._gyro_jump.take(off=is_shocked or bool(missing[1]))
             if not is_shocked:
                 jump_radps = self._gyro_jump.agrees(window.nav.gyro_bias)
             trusted = not is_shocked
@@ -170,7 +168,9 @@ class FrameUpdate:
         """
         if not self._has_imu or not self._gyro_jump.is_asked(predicted.innovation_ratio):
             return False
-        shown = motion_of_images(predicted.tracks, predicted.covariance, predicted.T_world_imu)
+        rows = predicted.tracks.rows
+        motion = ShownMotion(window, predicted.covariance, lambda: self.fit.linearise(window, rows))
+        shown = motion.find(predicted.tracks)
         if shown is None:
             return False
         self._gyro_jump.doubt_step(window, shown, self._propagation.since_frame)

@@ -11,6 +11,7 @@ The images estimate both anew: equation (N15) of docs/math.md.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from vio.filters.navigation import Growth
 from vio.filters.noise import (
     ROTATION,
     SLIGHTLY_INFORMED,
+    TRANSLATION,
     StepErrors,
     turn_shown,
     whitened_correction,
@@ -27,7 +29,7 @@ from vio.filters.noise import (
 from vio.filters.track_records import Residuals
 from vio.filters.window import Window
 from vio.filters.window_tracks import VIEW_PROBABILITY, LinearTracks, chi_square_table
-from vio.geometry.lie import FloatArray, so3_hat
+from vio.geometry.lie import FloatArray, length, so3_exp, so3_hat, so3_log
 from vio.numerics.kinds import Tolerance
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray
@@ -46,6 +48,8 @@ class _MotionRules(NamedTuple):
     # step of one that has jumped by 0.05 rad/s to 12
     sigmas: float = 10.0
     steps: Tolerance[int] = 8  # of the robust fit
+    max_moves: Tolerance[int] = 6  # of the pose, with the tracks linearised anew
+    small_turn: Tolerance[float] = 0.01  # rad, of which the square moves no pixel by a tenth
 
 
 _MOTION = _MotionRules()
@@ -56,7 +60,9 @@ MAX_GYRO_BIAS_RADPS = 0.5  # no sensor that works has more
 class _JumpRules(NamedTuple):
     """When the gyro's bias has jumped."""
 
-    # of a filter that has begun, in which a bias that is learned looks like a jump
+    # of a filter that has begun, after which a shock is told from what it did not know yet
+    first_steps: int = 10
+    # and a bias that jumps from one that is learned
     start_steps: int = 30
     # A jump comes after steps that agreed: of so many before the newest ones (which may belong to
     # it) so few are off. A gyro that is wrong all the time (its axes, clock, scale) is no gyro that
@@ -107,56 +113,113 @@ class Contradiction(NamedTuple):
     shift: FloatArray | None  # (3,) m; None: the translation is as predicted
 
 
-def motion_of_images(
-    predicted: LinearTracks, moved: FloatArray, T_world_imu: FloatArray
-) -> Contradiction | None:
-    """Fit the motion of the body by which the newest pixels of old tracks differ from the
-    predicted ones.
+class _OldTracks(NamedTuple):
+    """The newest pixels of old tracks, linearised by the body's motion about itself."""
 
-    None: its rotation is within what was predicted, or no single one explains nearly all of them.
+    D_motion: FloatArray  # (F, 4, 6)
+    r: FloatArray  # (F, 4)
+    variance: float  # of a pixel
 
-    Args:
-        predicted: tracks linearised where the motion model has the newest clone.
-        moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the world's
-            side.
-        T_world_imu: (4, 4) the body's pose there.
-    """
+
+def _old_tracks(predicted: LinearTracks, p_body: FloatArray) -> _OldTracks:
+    """Return what the newest clone sees of old tracks, of a body at (3,)."""
     old = _is_old(predicted.at)
-    if int(old.sum()) < _MOTION.min_old_tracks:
-        return None
-    p_body = T_world_imu[:3, 3]
     J = predicted.at.z_D_p[old, -1]
-    r = predicted.at.r[old, -1]
     arms = predicted.p_world[old] - p_body
-    B = np.concatenate([J, -J @ so3_hat(arms)], axis=2)  # by the body's motion about itself
-    about_body = np.eye(6)
-    about_body[:3, 3:] = -so3_hat(p_body)
-    expected = about_body @ moved @ about_body.T
-    variance = predicted.variance
-    of_shift = np.zeros((6, 6))
-    of_shift[:3, :3] = np.linalg.inv(expected[:3, :3])
-    shift: FloatArray | None = None
-    motion, P, left = _robust_fit(B, r, of_shift, variance)
-    if not _is_beyond(motion[3:], expected[3:, 3:] + P[3:, 3:]):
-        return None
-    # it may be the translation instead that is not as predicted, or both
-    free, P, free_left = _robust_fit(B, r, _MOTION.weight_of_unknown * of_shift, variance)
-    if _is_beyond(free[:3], expected[:3, :3] + P[:3, :3]):
-        shift = free[:3]
-        motion = free
-        left = free_left
-        if not _is_beyond(motion[3:], expected[3:, 3:] + P[3:, 3:]):
+    D_motion = np.concatenate([-J, J @ so3_hat(arms)], axis=2)  # points move the other way
+    return _OldTracks(D_motion, predicted.at.r[old, -1], predicted.variance)
+
+
+class ShownMotion:
+    """Fits the motion of the body by which the newest pixels of old tracks differ from the
+    predicted ones, and moves the newest pose by it.
+    """
+
+    def __init__(
+        self, window: Window, moved: FloatArray, linearise: Callable[[], LinearTracks]
+    ) -> None:
+        """Take a window at its prediction.
+
+        Args:
+            window: whose newest pose is moved.
+            moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the
+                world's side.
+            linearise: returns the tracks at the window's present means.
+        """
+        self._window = window
+        self._linearise = linearise
+        about_body = np.eye(6)
+        about_body[:3, 3:] = -so3_hat(window.nav.T_world_imu[:3, 3])
+        self._expected = about_body @ moved @ about_body.T
+        self._turned = np.eye(3)
+        self._shift = np.zeros(3)
+
+    def find(self, predicted: LinearTracks) -> Contradiction | None:
+        """Fit it to tracks that are linearised at the prediction.
+
+        None: its rotation is within what was predicted, or no single motion explains nearly all
+        old tracks; the pose is where it was.
+        """
+        window = self._window
+        before = window.nav, window.clones
+        found = self._found(_old_tracks(predicted, before[0].T_world_imu[:3, 3]))
+        if found is None:
+            window.nav, window.clones = before
+        return found
+
+    def _found(self, old: _OldTracks) -> Contradiction | None:
+        if len(old.r) < _MOTION.min_old_tracks:
             return None
-    pixels = np.any(J != 0.0, axis=2).sum(axis=1)
-    limits = variance * chi_square_table(VIEW_PROBABILITY)[pixels]
-    if np.mean(np.sum(left**2, axis=1) < limits) <= _MOTION.min_agreeing_share:
-        return None
-    return Contradiction(motion[3:], shift)
+        held = np.zeros((6, 6))
+        held[:3, :3] = np.linalg.inv(self._expected[:3, :3])
+        free = _MOTION.weight_of_unknown * held
+        motion, P, _ = _robust_fit(old, held)
+        if not self._is_beyond(motion, P, ROTATION):
+            return None
+        old = self._moved(old, held, shifts=False)
+        if len(old.r) < _MOTION.min_old_tracks:
+            return None
+        # it may be the translation instead that is not as predicted, or both
+        motion, P, _ = _robust_fit(old, free)
+        is_shifted = self._is_beyond(motion, P, TRANSLATION)
+        if is_shifted:
+            old = self._moved(old, free, shifts=True)
+        if len(old.r) < _MOTION.min_old_tracks:
+            return None
+        motion, P, left = _robust_fit(old, free if is_shifted else held)
+        turn = so3_log(self._turned)
+        if not self._is_beyond(np.concatenate([self._shift, turn]), P, ROTATION):
+            return None
+        pixels = np.any(old.D_motion[:, :, :3] != 0.0, axis=2).sum(axis=1)
+        width = CAUCHY * CAUCHY * old.variance
+        limits = width * chi_square_table(VIEW_PROBABILITY)[pixels]
+        if np.mean(np.sum(left**2, axis=1) < limits) <= _MOTION.min_agreeing_share:
+            return None
+        return Contradiction(turn, self._shift if is_shifted else None)
 
+    def _moved(self, old: _OldTracks, information: FloatArray, *, shifts: bool) -> _OldTracks:
+        """Move the pose by Gauss-Newton steps; return the tracks where it is."""
+        window = self._window
+        for _ in range(_MOTION.max_moves):
+            if len(old.r) < _MOTION.min_old_tracks:
+                break
+            motion = _robust_fit(old, information)[0]
+            shift = motion[:3] if shifts else np.zeros(3)
+            window.move_newest(motion[3:], shift)
+            self._turned = so3_exp(motion[3:]) @ self._turned
+            self._shift = self._shift + shift
+            old = _old_tracks(self._linearise(), window.nav.T_world_imu[:3, 3])
+            if float(np.linalg.norm(motion[3:])) < _MOTION.small_turn:
+                break
+        return old
 
-def _is_beyond(error: FloatArray, covariance: FloatArray) -> bool:
-    """Whether an error (3,) is beyond its covariance (3, 3) by far."""
-    return float(error @ np.linalg.solve(covariance, error)) > _MOTION.sigmas**2
+    def _is_beyond(self, motion: FloatArray, P: FloatArray, part: slice) -> bool:
+        """Whether a part of a motion (6,) with its covariance (6, 6) is beyond what was predicted
+        by far.
+        """
+        error = motion[part]
+        covariance = self._expected[part, part] + P[part, part]
+        return float(error @ np.linalg.solve(covariance, error)) > _MOTION.sigmas**2
 
 
 def _noise_of(growth: Growth, motion: FloatArray, part: int) -> FloatArray:
@@ -178,13 +241,6 @@ def _bias_doubt(growth: Growth, turn: FloatArray, seconds: float) -> FloatArray:
     return out
 
 
-def is_contradicted(innovation_ratio: float | None) -> bool:
-    """Whether innovations over their standard deviation, median, contradict the prediction; None:
-    there are none.
-    """
-    return (innovation_ratio or 0.0) > _JUMP.innovation_sigmas
-
-
 class GyroJump:
     """Tells a gyro whose bias has jumped from single steps that contradict it, as shocks do."""
 
@@ -197,34 +253,32 @@ class GyroJump:
         # (3,) the bias before it was doubted, and its standard deviations then; None: it is not
         self._before: tuple[FloatArray, FloatArray] | None = None
 
-    def take(self, *, off: bool, innovation_ratio: float | None) -> None:
-        """Take a step: whether its rotation was corrected by more than its noise, and its
-        innovations over their standard deviation, median; None: there are none.
-        """
+    def take(self, *, off: bool) -> None:
+        """Take a step, and whether the images contradicted its rotation."""
         self._steps += 1
-        self._off.append(off or is_contradicted(innovation_ratio))
+        self._off.append(off)
 
     def is_asked(self, innovation_ratio: float | None) -> bool:
-        """Whether innovations contradict the prediction, after a start that learns bias and tilt
-        and steps that agreed.
+        """Whether innovations over their standard deviation, median, contradict the prediction,
+        after a start that learns bias and tilt and steps that agreed; None: there are none.
         """
-        return is_contradicted(innovation_ratio) and self._settled
+        return (innovation_ratio or 0.0) > _JUMP.innovation_sigmas and self._settled
 
     def doubt_step(self, window: Window, shown: Contradiction, growth: Growth) -> None:
-        """Take what the images contradict of the newest step, and make it uncertain by as much;
-        the gyro's bias, too, if they did so by the like in the step before.
+        """Make what the images contradict of the newest step uncertain; the gyro's bias, too, if
+        they did so by the like in the step before.
 
         Args:
-            window: whose newest step it is.
+            window: whose newest step it is; its pose is where the images show it.
             shown: by which motion they contradict it.
             growth: of the state's error over the step.
         """
         seconds = window.last_step_s
         rate = shown.turn / seconds
-        window.move_newest(shown.turn, np.zeros(3) if shown.shift is None else shown.shift)
         if shown.shift is not None:
             window.inflate_process_noise(_noise_of(growth, shown.shift, 0))
-        if self.repeats(rate) and float(np.linalg.norm(rate)) <= MAX_GYRO_BIAS_RADPS:
+        is_bias = self._knows_bias and length(rate) <= MAX_GYRO_BIAS_RADPS
+        if self.repeats(rate) and is_bias:
             self._doubt_gyro(window, shown.turn, growth, seconds)
         else:
             window.inflate_process_noise(_noise_of(growth, shown.turn, 1))
@@ -238,7 +292,7 @@ class GyroJump:
             step: its correction.
             growth: of the state's error over the step.
         """
-        if not self._settled:
+        if not self._settled or not self._knows_bias:
             return False
         self._recent.append((step, window.last_step_s))
         recent = list(self._recent)
@@ -260,9 +314,13 @@ class GyroJump:
         window.inflate_process_noise(lacking)
 
     @property
+    def _knows_bias(self) -> bool:
+        return self._steps > _JUMP.start_steps
+
+    @property
     def _settled(self) -> bool:
         before = list(self._off)[: -_JUMP.newest_steps]
-        return self._steps > _JUMP.start_steps and sum(before) <= _JUMP.max_off_steps
+        return self._steps > _JUMP.first_steps and sum(before) <= _JUMP.max_off_steps
 
     def repeats(self, rate: FloatArray) -> bool:
         """Take the rate (3,) that a step was off by; return whether the last step was off by the
@@ -327,13 +385,15 @@ def _is_old(at: Residuals) -> BoolArray:
 
 
 def _robust_fit(
-    B: FloatArray, r: FloatArray, information: FloatArray, variance: float
+    old: _OldTracks, information: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit a motion (6,) with a prior's information to residuals (F, 4) by Cauchy weights.
+    """Fit a motion (6,) with a prior's information (6, 6) to tracks by Cauchy weights.
 
     Returns:
-        The motion, `r = B motion + noise`, its covariance (6, 6), and the residuals left (F, 4).
+        The motion, `r = D_motion motion + noise`, its covariance (6, 6), and the residuals left
+        (F, 4).
     """
+    B, r, variance = old
     width = CAUCHY * CAUCHY * variance
     left: FloatArray = r
     H = B.reshape(-1, 6)

@@ -40,8 +40,9 @@ class _NoiseRules(NamedTuple):
 _NOISE = _NoiseRules()
 _SURPRISING = chi_square_quantile(_NOISE.surprise_probability, np.arange(1, 4)).tolist()
 _EXCEPTIONAL = chi_square_quantile(_NOISE.exception_probability, np.arange(1, 4)).tolist()
+TRANSLATION = slice(0, 3)  # of a motion (6,)
 ROTATION = slice(3, 6)
-_PARTS = slice(0, 3), ROTATION  # translation, rotation
+_PARTS = TRANSLATION, ROTATION
 SLIGHTLY_INFORMED = _NOISE.doubted_share
 # d E[2 F_k(e^t x) - 1] / dt at t = 0 for x ~ chi-square(k), k = 0..3
 _SENSITIVITY = (0.0, 1 / np.pi, 0.5, 2 / np.pi)
