@@ -22,7 +22,7 @@ from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transfor
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import (
-    holds_readings,
+    names_readings,
     read_imu_table,
     read_sensor_table,
     read_velocity_table,
@@ -51,7 +51,9 @@ IMU_FILES = (
 # of a gyro and an accelerometer that have a file each
 _GYRO_FILES = ("gyro.csv", "gyro.txt", "gyr.csv", "gyr.txt", "gyroscope.csv", "gyroscope.txt")
 _ACCEL_FILES = (
-    "accel.csv", "accel.txt", "acc.csv", "acc.txt", "accelerometer.csv", "accelerometer.txt",
+    "accel.csv", "accel.txt", "acc.csv", "acc.txt",
+    "totalacceleration.csv",  # of a logger whose accelerometer.csv lacks gravity
+    "accelerometer.csv", "accelerometer.txt",
 )  # fmt: skip
 _REFERENCES = (
     "reference.tum", "reference.txt", "groundtruth.tum", "groundtruth_tum.txt", "groundtruth.txt", "gt_imu.csv",
@@ -331,11 +333,15 @@ def _read_imu(files: Sequence[Path], notes: list[str]) -> tuple[ImuRecord, Seque
 
 
 def _other_imu_notes(layout: Layout) -> list[str]:
-    """Say how to name a table that seems to be the IMU's and is not read by its name."""
+    """Say how to name tables that seem to be the IMU's and are not read by their names."""
     folders = dict.fromkeys((layout.root, layout.base))
-    files = [f for folder in folders for f in sorted(folder.glob("*[iI][mM][uU]*")) if f.is_file()]
-    found = [f for f in files if f.suffix.lower() in (".csv", ".txt") and holds_readings(f)]
-    return [f"{f}: not read; name it imu.csv if it is the IMU's" for f in found]
+    files = [f for folder in folders for f in sorted(folder.glob("*.[cCtT][sSxX][vVtT]"))]
+    found = {file: names_readings(file) for file in files if file.is_file()}
+    return [
+        f"{file}: not read; name it {wanted} if it is the IMU's"
+        for file, wanted in found.items()
+        if wanted is not None
+    ]
 
 
 def _read_reference(
