@@ -25,6 +25,7 @@ import numpy as np
 from vio.cameras.rig import Rig
 from vio.dataclass import dataclass
 from vio.datasets import rigs
+from vio.datasets.alternation import alternating_note
 from vio.datasets.companions import (
     ReadImages,
     calibration_beside,
@@ -428,7 +429,9 @@ def read_mono(path: Path, settings: DatasetSettings) -> ImageDataset:
             "left/"
         )
     files = list_images(layout.left)
-    images = _Images(FilePairs(files, files), _empty_partner_note(layout))
+    doubt = alternating_note(len(files), lambda k: load_gray(files[k])[0])
+    notes = (*_empty_partner_note(layout), *((doubt,) if doubt is not None else ()))
+    images = _Images(FilePairs(files, files), notes)
     return _read("mono", layout, images, settings)
 
 
