@@ -25,7 +25,7 @@ from vio.datasets.alternation import alternating_note
 from vio.datasets.companions import ReadImages, find_calibration_of, read_companions
 from vio.datasets.frame_times import nearest
 from vio.datasets.image_pairs import ImageRecording, half_of
-from vio.datasets.image_times import times_of
+from vio.datasets.image_times import TIME_LISTS, times_of
 from vio.datasets.images import UnreadableImageError, prefetch
 from vio.datasets.reader import Reader
 from vio.datasets.rigs import load_rig
@@ -220,7 +220,8 @@ def _times(
         if left.count != right.count
         else []
     )
-    if (file := path / "times.txt").is_file():
+    lists = (path / name for name in TIME_LISTS)
+    if (file := next((file for file in lists if file.is_file()), None)) is not None:
         names = [(Path(f"{k}"), Path(f"{k}")) for k in range(count)]
         doubts = list[str]()
         times_ns = times_of(file, tuple(names), doubts)
