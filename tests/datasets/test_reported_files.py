@@ -583,3 +583,13 @@ def test_what_lies_beside_images_in_an_unpacked_folder_is_read(tmp_path: Path) -
     recording = open_dataset(tmp_path).recording
     assert recording.reference is not None
     assert recording.frame_times_ns.tolist() == STAMPS
+
+
+def test_ground_truth_by_another_name_is_named(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    (folder / "reference.tum").rename(folder / "vicon_room.txt")
+    (folder / "poses.csv").write_text("made with another program\n")
+    shutil.copy(folder / "vicon_room.txt", folder / "estimate.txt")
+    notes = open_dataset(folder).recording.notes
+    (note,) = [note for note in notes if "if it is the ground truth" in note]
+    assert "vicon_room.txt: poses, not read; name it reference.txt" in note

@@ -11,6 +11,7 @@ import pytest
 
 from vio.errors import DataError, EvaluationError
 from vio.evaluation.trajectories import evaluate
+from vio.files.text import check_increasing
 from vio.files.trajectories import is_trajectory_file, read_trajectory, write_tum
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_from_parts, so3_exp
 from vio.records import Trajectory
@@ -270,3 +271,38 @@ def test_poses_without_times_are_told_so_before_an_extrinsic_is_asked_for(tmp_pa
     np.savetxt(tmp_path / "poses.txt", matrices)
     with pytest.raises(EvaluationError, match="30 poses without times"):
         evaluate(read_trajectory(tmp_path / "poses.txt"), TRUTH)
+
+
+def test_poses_that_a_camera_system_lost_and_rows_written_twice_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = _write(tmp_path / "truth.txt", "", SECONDS, XYZW)
+    rows = file.read_text().splitlines()
+    rows[3] = SECONDS[3] + 7 * " nan"
+    rows.insert(10, rows[10])
+    file.write_text("\n".join(rows) + "\n")
+    found = read_trajectory(file)
+    kept = np.arange(COUNT) != 3
+    np.testing.assert_array_equal(found.times_ns, TIMES_NS[kept])
+    np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body[kept], atol=1e-12)
+    assert any("1 poses are not numbers and are left out" in line for line in caplog.messages)
+    assert any("1 rows repeat the one above" in line for line in caplog.messages)
+    lost = [stamp + 7 * " nan" for stamp in SECONDS[: COUNT // 2]]
+    file.write_text("\n".join([*lost, *rows[-10:]]) + "\n")
+    with pytest.raises(DataError, match="line 1: a pose is not finite"):
+        read_trajectory(file)
+    rows[3] = f"{SECONDS[3]} nan 0 0 0 0 0 1"
+    file.write_text("\n".join(rows) + "\n")
+    with pytest.raises(DataError, match="line 4: a pose is not finite"):
+        read_trajectory(file)
+
+
+@pytest.mark.parametrize(
+    ("unit_ns", "unit"), [(1, "nanoseconds"), (10**3, "microseconds"), (10**6, "milliseconds")]
+)
+def test_a_counter_of_32_bits_that_begins_again_is_named(unit_ns: int, unit: str) -> None:
+    counted = (2**32 - 20_000 + 5_000 * np.arange(8)) % 2**32
+    with pytest.raises(DataError, match=f"begins again there: add 2.32 {unit} to it"):
+        check_increasing(unit_ns * counted, lambda k: f"line {k}")
+    with pytest.raises(DataError, match="remove or reorder that entry"):
+        check_increasing(unit_ns * (counted * 97 // 100), lambda k: f"line {k}")

@@ -151,7 +151,9 @@ def read_trajectory(
             f"{table.path}: its header names latitude and longitude, which are no metres; give "
             "positions in metres, as a local frame of east, north and up has them"
         )
+    table = _without_repeats(table)
     columns = pose_columns(table.comments, len(table.fields(0)), w_first=kind == "euroc")
+    table = _without_lost(table, columns)
     times_ns = _times_ns(table, columns, kind)
     poses, orientations = _quaternion_poses(table, columns, kind)
     comments = table.comments if kind == "tum" else []
@@ -162,6 +164,41 @@ def read_trajectory(
         poses, times_ns, _body(table, header_body, body) or _DEFAULT_BODY[kind], numbers
     )
     return _with_orientations(table, trajectory, orientations, columns.orientations)
+
+
+def _without_repeats(table: _Table) -> _Table:
+    """Return a table without rows that repeat the one above, with a warning."""
+    kept = [k for k, row in enumerate(table.rows) if not k or row != table.rows[k - 1]]
+    repeated = len(table.rows) - len(kept)
+    if repeated:
+        logger.warning("%s: %d rows repeat the one above and are left out", table.path, repeated)
+    return _some_rows(table, kept)
+
+
+def _without_lost(table: _Table, columns: PoseColumns) -> _Table:
+    """Return a table without poses none of whose numbers is one, as where a camera system lost the
+    body, with a warning; where most are such, more is wrong.
+    """
+    cells = (*columns.position, *(columns.quaternion or ()))
+    last = max(cells) + 1
+    kept = []
+    for k in range(len(table.rows)):
+        fields = table.fields(k, last)
+        if not all(fields[cell].strip().lower() == "nan" for cell in cells):
+            kept.append(k)
+    lost = len(table.rows) - len(kept)
+    if not 0 < lost < len(kept):
+        return table
+    logger.warning("%s: %d poses are not numbers and are left out", table.path, lost)
+    return _some_rows(table, kept)
+
+
+def _some_rows(table: _Table, kept: Sequence[int]) -> _Table:
+    return replace(
+        table,
+        rows=[table.rows[k] for k in kept],
+        line_numbers=[table.line_numbers[k] for k in kept],
+    )
 
 
 def _matrices(table: _Table, body: BodyFrame | None) -> Trajectory:
