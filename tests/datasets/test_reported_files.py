@@ -562,6 +562,11 @@ def test_a_lost_image_before_the_last_number_is_no_counter_that_began_again(tmp_
     assert overflow_notes(tuple(zip(files, files, strict=True))) == ()
 
 
+def test_numbers_that_are_dates_are_no_counter() -> None:
+    files = tuple(Path(f"{k}.png") for k in (0, 1, 20240512140400010000, 99999999999999999999))
+    assert overflow_notes(tuple(zip(files, files, strict=True))) == ()
+
+
 def test_files_of_several_images_are_doubted(tmp_path: Path) -> None:
     folder = make_plain(tmp_path, imu=False, reference=False)
     for side in ("left", "right"):

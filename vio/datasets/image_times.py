@@ -361,7 +361,7 @@ def overflow_notes(pairs: ImagePairs) -> tuple[str, ...]:
     part out: a camera's counter that began again amid a recording.
     """
     numbers = [number for number in _numbers_of(_left_files(pairs)) if isinstance(number, int)]
-    if len(numbers) < len(pairs) or len(numbers) < 2:
+    if len(numbers) < max(len(pairs), 2) or max(numbers) >= _LARGEST_COUNT:
         return ()
     ordered = np.sort(np.array(numbers, dtype=np.int64))
     last = int(ordered[-1])
