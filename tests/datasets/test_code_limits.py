@@ -29,7 +29,7 @@ from vio.datasets.observation_log import read_observation_log, write_observation
 from vio.datasets.png import decode_gray8
 from vio.datasets.rigs import camodocal, depthai, zed
 from vio.datasets.rigs.source import Source
-from vio.datasets.tables import holds_readings
+from vio.datasets.tables import names_readings
 from vio.datasets.tracks import tracks_from_dense
 from vio.datasets.tum_rgbd import published_camera
 from vio.datasets.unused import Layout
@@ -153,7 +153,8 @@ def _oxts_sigma_m(column: int, stated_m: float) -> float:
 
 def _could_be_imu(columns: int) -> bool:
     line = ",".join(["1403636579763555584", *["0.5"] * (columns - 1)])
-    return bool(_read_text(f"{line}\n", holds_readings))
+    named = lambda file: names_readings(file.rename(file.with_name("imu_a.txt")))  # noqa: E731
+    return bool(_read_text(f"{line}\n", named))
 
 
 def _is_seen(pixel: float) -> bool:

@@ -296,3 +296,15 @@ def test_run_takes_seconds(flight: Path, tmp_path: Path) -> None:
     text = (out / "trajectory.tum").read_text()
     assert "# frames: 2-4" in text
     assert len(frames_of(open_dataset(flight), 2, 5)) == 3
+
+
+@pytest.mark.parametrize("name", ["timestamps.csv", "timestamps.txt"])
+def test_times_of_videos_may_be_named_as_those_of_folders(
+    videos: Path, tmp_path: Path, name: str
+) -> None:
+    folder = copy_of(videos, tmp_path / "v")
+    expected = open_dataset(folder).recording.frame_times_ns
+    rows = [f"{k},{t}\n" for k, t in enumerate(expected.tolist())]
+    (folder / "times.txt").unlink()
+    (folder / name).write_text("frame,timestamp [ns]\n" + "".join(rows))
+    np.testing.assert_array_equal(open_dataset(folder).recording.frame_times_ns, expected)

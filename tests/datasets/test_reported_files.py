@@ -19,6 +19,7 @@ from tests.euroc_maker import RADTAN_RIG
 from tests.plain_maker import make_plain
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
+from vio.datasets.image_times import overflow_notes
 from vio.datasets.images import UnreadableImageError, exif_turn, load_gray
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.sides import split_sides
@@ -370,6 +371,10 @@ def test_jpeg_may_be_named_jfif(tmp_path: Path) -> None:
         ("bag.db3.zstd", "its folder with metadata.yaml is read as it is"),
         ("left/0.jp2", "holds 1 files .jp2, which are not read; write the images as PNG"),
         ("left/0.heic", "holds 1 files .heic, which are not read"),
+        ("left.h265", "is a stream of images without times, which is not read; pack it"),
+        ("VID_00.insv", "a video of several lenses, which is not read; export one mp4 a lens"),
+        ("flight.ulg", "a log of PX4, which is not read; write its IMU as a table"),
+        ("map.db", "a database, as of RTAB-Map"),
     ],
 )
 def test_files_of_other_forms_are_named_with_what_to_do(
@@ -502,3 +507,94 @@ def test_a_list_may_have_the_times_of_both_cameras(
         return
     with pytest.raises(DataError, match="there must be one time an image"):
         open_dataset(folder)
+
+
+@pytest.mark.parametrize("name", ["rec.svo2", "rec.vrs", "rec.db"])
+def test_a_file_of_another_program_is_no_damaged_bag(name: str, tmp_path: Path) -> None:
+    beginning = {"rec.svo2": b"\x89MCAP0\r\n", "rec.db": b"SQLite format 3\0"}
+    (tmp_path / name).write_bytes(beginning.get(name, b"VisionRe") + bytes(64))
+    with pytest.raises(DataError, match=re.escape(f"{name}: is a")) as caught:
+        open_dataset(tmp_path / name)
+    assert "which is not read" in str(caught.value)
+
+
+def test_what_systems_leave_in_folders_is_no_recording(tmp_path: Path) -> None:
+    for name in ("Thumbs.db", "._rec.db"):
+        (tmp_path / name).write_bytes(b"left")
+    with pytest.raises(DataError, match="no known recording"):
+        open_dataset(tmp_path)
+
+
+def test_videos_that_are_no_pair_are_listed(tmp_path: Path) -> None:
+    for side in ("left", "right"):
+        for part in (1, 2):
+            (tmp_path / f"{side}_GH0{part}0001.mp4").write_bytes(b"film")
+    with pytest.raises(DataError, match=r"holds the videos left_GH010001.mp4, .* no pair"):
+        open_dataset(tmp_path)
+
+
+def _numbered(folder: Path, numbers: list[int]) -> Path:
+    name = lambda side, k: f"IMG_{numbers[k]:04d}.png"  # noqa: E731
+    return make_plain(folder, len(numbers), name=name, times=False, imu=False, reference=False)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "begun_again"),
+    [
+        ([9997, 9998, 9999, 1, 2], True),
+        ([998, 999, 0, 1], True),
+        ([9996, 9997, 9998, 1, 2], False),
+        ([9998, 9999, 5, 6], False),
+        ([9997, 9998, 9999], False),
+        ([*range(990, 993), 999, *range(1, 3)], False),
+    ],
+)
+def test_a_counter_that_began_again_amid_a_recording_is_doubted(
+    numbers: list[int], begun_again: bool, tmp_path: Path
+) -> None:
+    """The images of the end came first, and a run called it a view that changes."""
+    notes = open_dataset(_numbered(tmp_path, numbers)).recording.notes
+    assert any("counter began again" in note for note in notes) is begun_again
+
+
+def test_a_lost_image_before_the_last_number_is_no_counter_that_began_again(tmp_path: Path) -> None:
+    files = tuple(Path(f"{k:04d}.png") for k in range(1000) if k != 998)
+    assert overflow_notes(tuple(zip(files, files, strict=True))) == ()
+
+
+def test_numbers_that_are_dates_are_no_counter() -> None:
+    files = tuple(Path(f"{k}.png") for k in (0, 1, 20240512140400010000, 99999999999999999999))
+    assert overflow_notes(tuple(zip(files, files, strict=True))) == ()
+
+
+def test_files_of_several_images_are_doubted(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, imu=False, reference=False)
+    for side in ("left", "right"):
+        for k in range(4):
+            image = cv2.imread(str(folder / side / f"{k}.png"), cv2.IMREAD_GRAYSCALE)
+            assert image is not None
+            (folder / side / f"{k}.png").unlink()
+            assert cv2.imwritemulti(str(folder / side / f"{k}.tif"), [image] * (3 if k == 0 else 1))
+    (doubt,) = [n for n in open_dataset(folder).recording.notes if "holds 3 images" in n]
+    assert doubt.startswith("doubtful: ")
+
+
+def test_what_lies_beside_images_in_an_unpacked_folder_is_read(tmp_path: Path) -> None:
+    """The calibration beside them was not found."""
+    inner = make_plain(tmp_path / "archive" / "2024-01-01")
+    expected = _samples(inner)
+    found = _samples(tmp_path)
+    assert found[0] == expected[0]
+    recording = open_dataset(tmp_path).recording
+    assert recording.reference is not None
+    assert recording.frame_times_ns.tolist() == STAMPS
+
+
+def test_ground_truth_by_another_name_is_named(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    (folder / "reference.tum").rename(folder / "vicon_room.txt")
+    (folder / "poses.csv").write_text("made with another program\n")
+    shutil.copy(folder / "vicon_room.txt", folder / "estimate.txt")
+    notes = open_dataset(folder).recording.notes
+    (note,) = [note for note in notes if "if it is the ground truth" in note]
+    assert "vicon_room.txt: poses, not read; name it reference.txt" in note

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vio.errors import DataError
+from vio.errors import DataError, EvaluationError
 from vio.evaluation.trajectories import evaluate
+from vio.files.text import check_increasing
 from vio.files.trajectories import is_trajectory_file, read_trajectory, write_tum
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_from_parts, so3_exp
 from vio.records import Trajectory
@@ -71,6 +72,14 @@ STATED = {
         "# frame_id [ns], translation (t_x, t_y, t_z), rotation (q_x, q_y, q_z, w), scale, quality",
         NS,
         [*XYZW, ZERO[:, :2]],
+        ",",
+    ),
+    "glasses": (
+        "tracking_timestamp_us,utc_timestamp_ns,tx_world_device,ty_world_device,tz_world_device,"
+        "qx_world_device,qy_world_device,qz_world_device,qw_world_device,"
+        "device_linear_velocity_x_device,gravity_x_world,quality_score",
+        [str(t // 1000) for t in TIMES_NS.tolist()],
+        [ZERO[:, 0], *XYZW, ZERO[:, :3]],
         ",",
     ),
     "rostopic": (
@@ -227,3 +236,73 @@ def test_whole_matrices_are_read(tmp_path: Path) -> None:
     np.savetxt(file, poses.reshape(3, 16))
     with pytest.raises(DataError, match="line 2: the last of 16 columns are not 0 0 0 1"):
         read_trajectory(file)
+
+
+@pytest.mark.parametrize(("rows", "body"), [(3, "imu"), (4, "cam0")])
+def test_matrices_may_have_a_number_or_a_time_in_front(
+    rows: int, body: str, tmp_path: Path
+) -> None:
+    matrices = TRUTH.T_world_body[:, :rows].reshape(COUNT, -1)
+    numbers = [str(2 * k + 1) for k in range(COUNT)]
+    found = read_trajectory(_write(tmp_path / "poses.txt", "", numbers, [matrices]))
+    assert found.times_ns is None
+    assert found.body == body
+    np.testing.assert_array_equal(found.frame_indices, 2 * np.arange(COUNT) + 1)
+    np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body, atol=1e-12)
+    timed = read_trajectory(_write(tmp_path / "timed.txt", "", SECONDS, [matrices]))
+    np.testing.assert_array_equal(timed.times_ns, TIMES_NS)
+    numbers[7] = "3"
+    with pytest.raises(DataError, match="line 8: the numbers of frames do not increase"):
+        read_trajectory(_write(tmp_path / "poses.txt", "", numbers, [matrices]))
+
+
+@pytest.mark.parametrize(
+    "line", ["VERTEX_SE3:QUAT 1 0 0 0 0 0 0 1", "VERTEX3 1 0 0 0 0 0 0", "EDGE_SE3:QUAT 1 2 0 0 0"]
+)
+def test_a_graph_has_no_times(line: str, tmp_path: Path) -> None:
+    file = tmp_path / "graph.g2o"
+    file.write_text(line + "\n")
+    with pytest.raises(DataError, match=r"a graph of poses .* which have no times"):
+        read_trajectory(file)
+
+
+def test_poses_without_times_are_told_so_before_an_extrinsic_is_asked_for(tmp_path: Path) -> None:
+    matrices = TRUTH.T_world_body[::2, :3].reshape(COUNT // 2, 12)
+    np.savetxt(tmp_path / "poses.txt", matrices)
+    with pytest.raises(EvaluationError, match="30 poses without times"):
+        evaluate(read_trajectory(tmp_path / "poses.txt"), TRUTH)
+
+
+def test_poses_that_a_camera_system_lost_and_rows_written_twice_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = _write(tmp_path / "truth.txt", "", SECONDS, XYZW)
+    rows = file.read_text().splitlines()
+    rows[3] = SECONDS[3] + 7 * " nan"
+    rows.insert(10, rows[10])
+    file.write_text("\n".join(rows) + "\n")
+    found = read_trajectory(file)
+    kept = np.arange(COUNT) != 3
+    np.testing.assert_array_equal(found.times_ns, TIMES_NS[kept])
+    np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body[kept], atol=1e-12)
+    assert any("1 poses are not numbers and are left out" in line for line in caplog.messages)
+    assert any("1 rows repeat the one above" in line for line in caplog.messages)
+    lost = [stamp + 7 * " nan" for stamp in SECONDS[: COUNT // 2]]
+    file.write_text("\n".join([*lost, *rows[-10:]]) + "\n")
+    with pytest.raises(DataError, match="line 1: a pose is not finite"):
+        read_trajectory(file)
+    rows[3] = f"{SECONDS[3]} nan 0 0 0 0 0 1"
+    file.write_text("\n".join(rows) + "\n")
+    with pytest.raises(DataError, match="line 4: a pose is not finite"):
+        read_trajectory(file)
+
+
+@pytest.mark.parametrize(
+    ("unit_ns", "unit"), [(1, "nanoseconds"), (10**3, "microseconds"), (10**6, "milliseconds")]
+)
+def test_a_counter_of_32_bits_that_begins_again_is_named(unit_ns: int, unit: str) -> None:
+    counted = (2**32 - 20_000 + 5_000 * np.arange(8)) % 2**32
+    with pytest.raises(DataError, match=f"begins again there: add 2.32 {unit} to it"):
+        check_increasing(unit_ns * counted, lambda k: f"line {k}")
+    with pytest.raises(DataError, match="remove or reorder that entry"):
+        check_increasing(unit_ns * (counted * 97 // 100), lambda k: f"line {k}")

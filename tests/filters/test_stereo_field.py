@@ -442,3 +442,14 @@ def test_pixel_field_of_an_estimate_without_rows_has_none() -> None:
     )
     moved = field.at(np.array([[300.0, 100.0, 290.0, 100.0]]))
     np.testing.assert_allclose(moved, [[0, 0, 1e-3 * CAMERA.fu, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("k", [-1e3, 1e3])
+def test_a_step_of_the_fit_beyond_all_cameras_leads_to_no_rig(k: float) -> None:
+    """Raw images of a compressed recording under the calibration of rectified ones ended a run with
+    an OverflowError.
+    """
+    off = np.zeros(len(PARAMETERS))
+    off[PARAMETERS.index("k")] = k
+    with pytest.raises(CalibrationError, match="focal lengths are off"):
+        rig_off_by(RECTIFIED, off)

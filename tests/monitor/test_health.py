@@ -83,6 +83,18 @@ def test_rows_that_no_rig_comes_to_are_not_laid_on_the_calibration_alone(
     assert words in line
 
 
+def test_rows_that_come_out_as_those_of_another_pair_are_named_once_more() -> None:
+    health = RunHealth()
+    found = [
+        finding.code
+        for k, rows_px in enumerate((0.42, 4.3, 13.9, 13.9, 0.42))
+        for finding in health.frame(
+            k, GOOD, _estimate(k, stereo_field=StereoFieldEstimate(np.zeros(8), np.eye(8), rows_px))
+        )
+    ]
+    assert found == ["stereo-calibration-off", "other-calibration"]
+
+
 def test_what_a_run_corrects_of_the_calibration_is_no_warning() -> None:
     for rows_px, corrected in ((0.42, True), (4.3, False), (26.0, False)):
         field = StereoFieldEstimate(np.zeros(8), np.eye(8), rows_px)

@@ -511,6 +511,12 @@ _IMU_NS = _EPOCH + np.arange(4000) * 5_000_000
         (_IMU_NS // 1000, "clocks without overlap", "1e+3 the IMU's stamps cover the frames"),
         (_IMU_NS // 10**6, "clocks without overlap", "milliseconds"),
         (_IMU_NS - _EPOCH, "clocks without overlap", "different epochs"),
+        (
+            _IMU_NS + 37 * 10**9,
+            "clocks without overlap",
+            "the IMU are late by 37 s, as TAI and UTC",
+        ),
+        (_IMU_NS - _EPOCH, "clocks without overlap", "count from the start of a device"),
         (_IMU_NS[:0], "clocks without overlap", "epoch"),
         (_IMU_NS[:1000], "clocks overlap in part", "cut short"),
         ((_IMU_NS - _EPOCH) // 1000 + _EPOCH, "clocks overlap in part", ""),

@@ -33,6 +33,7 @@ from vio.guard.guarded import guarded
 from vio.inspection.inertial import allan_deviation, noise_part, rest_part
 from vio.inspection.inspect import (
     _pairs_parts,
+    _reference_part,
     _track,
     _tracking_parts,
     clock_facts,
@@ -434,3 +435,17 @@ def test_windows_of_pairs_that_overlap_read_no_frame_twice(
     monkeypatch.setattr(ImageRecording, "events", noted)
     _pairs_parts(dataset, range(20))
     assert sorted(read) == list(range(20))
+
+
+def test_ground_truth_of_another_clock_is_named(tmp_path: Path) -> None:
+    """It covered '0 % of the frames', and nothing was missing."""
+    folder = make_plain(tmp_path)
+    file = folder / "reference.tum"
+    shifted_s = lambda match: f"{int(match[1]) + 18}."  # noqa: E731
+    recording = open_dataset(folder).recording
+    assert "another clock" not in _reference_part(recording, recording.frame_times_ns).text
+    file.write_text(re.sub(r"(?m)^(\d+)\.", shifted_s, file.read_text()))
+    recording = open_dataset(folder).recording
+    text = _reference_part(recording, recording.frame_times_ns).text
+    assert "over 0 % of the frames: of another clock or recording; it begins +18.000 s" in text
+    assert "the ground truth are late by 18 s, as GPS time and UTC" in text

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vio.errors import DataError
+from vio.errors import DataError, EvaluationError
 from vio.evaluation.trajectories import evaluate
+from vio.files.epochs import epoch_hint
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 from vio.records import Trajectory
@@ -63,6 +64,58 @@ def test_a_left_handed_reference_is_named() -> None:
     poses[:, 1, 3] *= -1
     notes = evaluate(_odometry(1.0, 1e-4, 0.02), replace(truth, T_world_body=poses)).notes
     assert len([note for note in notes if "its axes are left-handed" in note]) == 1
+
+
+def test_inverse_poses_are_named() -> None:
+    estimate = _odometry(1.02, 1e-4, 0.02)
+    inverse = replace(estimate, T_world_body=se3_inverse(estimate.T_world_body))
+    notes = evaluate(inverse, _trajectory()).notes
+    assert len([note for note in notes if "poses of one of the two are inverted" in note]) == 1
+    alone = replace(inverse, orientations="none")
+    assert not [note for note in evaluate(alone, _trajectory()).notes if "inverted" in note]
+
+
+def test_placeholders_amid_an_estimate_are_named() -> None:
+    poses = _odometry(1.0, 1e-4, 0.02).T_world_body.copy()
+    poses = se3_inverse(poses[0]) @ poses
+    poses[:5] = np.eye(4)  # as where a body stands at first
+    whole = replace(_trajectory(), T_world_body=poses)
+    assert not [n for n in evaluate(whole, _trajectory()).notes if "placeholders" in n]
+    poses = poses.copy()
+    poses[100:108] = np.eye(4)
+    (note,) = [
+        note
+        for note in evaluate(replace(whole, T_world_body=poses), _trajectory()).notes
+        if "placeholders" in note
+    ]
+    assert note.startswith("8 poses of the estimate, from row 100 on, are the identity")
+
+
+@pytest.mark.parametrize(
+    ("shift_s", "words"),
+    [
+        (36.9, "reference are late by 37 s, as TAI and UTC, differ"),
+        (-18.2, "reference are early by 18 s, as GPS time and UTC, or 19 s, as TAI and GPS"),
+        (7200.0, "late by 7200 s, as time zones, differ"),
+        (-START_NS / 1e9, "count from the start of a device"),
+        (55.0, None),
+        (7300.0, None),
+    ],
+)
+def test_usual_clocks_explain_times_that_do_not_overlap(shift_s: float, words: str | None) -> None:
+    with pytest.raises(EvaluationError, match="check the clocks") as caught:
+        evaluate(_trajectory(count=300), _trajectory(shift_s=shift_s, count=300))
+    text = str(caught.value)
+    if words is None:
+        assert text.endswith("allow a larger difference")
+    else:
+        assert words in text
+
+
+def test_long_recordings_are_not_explained_by_whole_hours() -> None:
+    own = (START_NS, START_NS + 3000 * 10**9)
+    later = (START_NS + 7200 * 10**9, START_NS + 10200 * 10**9)
+    assert not epoch_hint(own, later, "the IMU")
 
 
 @pytest.mark.parametrize("scale", [0.9, 1.0, 1.1])

@@ -19,7 +19,7 @@ from tests.replaced_rules import replaced
 from vio.cli import main
 from vio.config import Config
 from vio.datasets.rigs import load_rig
-from vio.errors import DataError
+from vio.errors import NOTE, DataError
 from vio.files.trajectories import read_trajectory
 from vio.findings import Finding
 from vio.live.live_odometry import LiveOdometry
@@ -100,7 +100,10 @@ def test_a_reset_ends_a_folder_and_begins_another(flight: Path, tmp_path: Path) 
     assert not list(tmp_path.glob("*/unfinished"))
 
 
-def test_an_earlier_folder_is_kept(flight: Path, tmp_path: Path) -> None:
+def test_an_earlier_folder_is_kept_and_the_new_one_is_named(
+    flight: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(NOTE)
     out = tmp_path / "out"
     out.mkdir()
     (out / "notes.txt").write_text("mine")
@@ -109,6 +112,7 @@ def test_an_earlier_folder_is_kept(flight: Path, tmp_path: Path) -> None:
         _feed(odometry, flight)
     folder.close()
     assert [path.name for path in out.iterdir()] == ["notes.txt"]
+    assert f"the results are in {tmp_path / 'out-2'}" in caplog.messages
     assert len(read_finished_run(tmp_path / "out-2").trajectory) == FRAMES
     file = tmp_path / "file"
     file.touch()

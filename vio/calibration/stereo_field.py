@@ -32,7 +32,7 @@ from vio.geometry.distortion import (
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import MapArray, rectified_cameras, rectify_pixels
 from vio.geometry.stereo import StereoCamera, left_rays
-from vio.numerics.kinds import Tolerance
+from vio.numerics.kinds import Capacity, Tolerance
 from vio.records import (
     FIELD_TERMS,
     RIGHT_TERMS,
@@ -95,6 +95,8 @@ class _FitRules(NamedTuple):
     settled_sigmas: Tolerance[float] = (
         1e-4  # standard deviations of a step after which there is no other
     )
+    # logarithm of a factor of the focal lengths: of beyond, powers overflow
+    max_log_focal: Capacity[float] = 10.0
 
 
 _FIT = _FitRules()
@@ -300,6 +302,8 @@ def _longer(camera: CameraModel, focal: float) -> CameraModel:
     """
     if focal == 0:
         return camera
+    if abs(focal) > _FIT.max_log_focal:
+        raise CalibrationError("focal lengths are off by more than those of any camera")
     powers = camera.lens.radius_powers(len(camera.coefficients))
     coefficients = tuple(
         c * math.exp(n * focal) for c, n in zip(camera.coefficients, powers, strict=True)

@@ -152,10 +152,10 @@ def _parse(source: str) -> tuple[str | None, Path]:
 
 def _detect(path: Path) -> str:
     """Detect the kind of a recording from its content."""
-    from vio.datasets.unused import ARCHIVES
+    from vio.datasets.unused import ARCHIVES, foreign_file
 
-    # a zip file's beginning is that of NumPy's archives, too
-    packed = path.is_file() and path.suffix.lower() in ARCHIVES
+    # the beginning of others' files is that of a bag or of NumPy's archives, too
+    packed = path.is_file() and (path.suffix.lower() in ARCHIVES or foreign_file(path) is not None)
     kind = None if packed else _folder_kind(path) if path.is_dir() else _file_kind(path)
     if kind is None:
         raise DataError(_unknown(path))
@@ -180,7 +180,7 @@ def _unknown(path: Path) -> str:
     """Say what is missing where there are images or a video, else what was looked for."""
     from vio.datasets import images, plain, videos
     from vio.datasets.plain import ALONE, images_of_one_camera
-    from vio.datasets.unused import unread_files
+    from vio.datasets.unused import listed, unread_files
 
     if path.is_dir() and len(plain.image_folders(path)) > 1:
         return (
@@ -209,6 +209,13 @@ def _unknown(path: Path) -> str:
         return f"{path}: is one video; give a folder with left.mp4, right.mp4 and the calibration of the pair"
     if (unread := unread_files(path)) is not None:
         return unread
+    if path.is_dir():
+        films = [file.name for file in path.iterdir() if file.suffix.lower() in videos.SUFFIXES]
+        if len(films) > 1:
+            return (
+                f"{path}: holds the videos {listed(sorted(films))}, which are no pair by their names; "
+                "name them left and right, the parts of a long one joined"
+            )
     return f"{path}: no known recording; looked for {_looked_for()}"
 
 

@@ -4,6 +4,7 @@ the rest.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transfor
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import (
-    holds_readings,
+    names_readings,
     read_imu_table,
     read_sensor_table,
     read_velocity_table,
@@ -30,7 +31,7 @@ from vio.datasets.tables import (
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError, EvaluationError
 from vio.evaluation.numbering import numbered_by_images
-from vio.files.trajectories import read_trajectory
+from vio.files.trajectories import is_trajectory_file, read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.imu.clocks import judge_clocks
 from vio.imu.sampling import sampling_notes
@@ -51,12 +52,17 @@ IMU_FILES = (
 # of a gyro and an accelerometer that have a file each
 _GYRO_FILES = ("gyro.csv", "gyro.txt", "gyr.csv", "gyr.txt", "gyroscope.csv", "gyroscope.txt")
 _ACCEL_FILES = (
-    "accel.csv", "accel.txt", "acc.csv", "acc.txt", "accelerometer.csv", "accelerometer.txt",
+    "accel.csv", "accel.txt", "acc.csv", "acc.txt",
+    "totalacceleration.csv",  # of a logger whose accelerometer.csv lacks gravity
+    "accelerometer.csv", "accelerometer.txt",
 )  # fmt: skip
 _REFERENCES = (
-    "reference.tum", "reference.txt", "groundtruth.tum", "groundtruth_tum.txt", "groundtruth.txt", "gt_imu.csv",
+    "reference.tum", "reference.txt", "reference.csv",
+    "groundtruth.tum", "groundtruth_tum.txt", "groundtruth.txt", "gt_imu.csv",
     "mocap0/data.csv", "state_groundtruth_estimate0/data.csv", "poses.txt",
 )  # fmt: skip
+# files of poses by other names that may be ground truth; an estimate is not called so
+_NAMED_TRUTH = re.compile(r"truth|pose|vicon|mocap|optitrack|leica|(?:^|_)gt(?:_|$)")
 _LONG_SHIFT_S = 1.0  # as of one that was written in milliseconds
 _CALIBRATION_FOLDERS = ("", "dso", "calibration", "calib", "extras")
 _SHARED_FOLDERS = ("calibration", "extras")  # of 4Seasons and Monado
@@ -212,15 +218,18 @@ def read_companions(
             settings.interpolation, settings.projection, depth_noise=depth_noise
         )
     reference_file = None
+    truth_notes: Sequence[str] = ()
     if reference is None:
         reference, reference_file = _read_reference(images, rig, rectifier)
+        if reference is None:
+            truth_notes = _other_truth_notes(layout, motion_files)
     read = [source for source in (file, times_file, reference_file) if source is not None]
     beside = Beside(
         motion,
         motion_notes,
         reference,
         [*read, *extrinsics, *motion_files, *images.used],
-        (*images.notes, *rig.notes),
+        (*images.notes, *truth_notes, *rig.notes),
         [file] * len(rig.cameras),
     )
     has_body = rig.T_cam0_imu is not None and (rig.cam1 is not None or len(motion_files) > 0)
@@ -331,11 +340,15 @@ def _read_imu(files: Sequence[Path], notes: list[str]) -> tuple[ImuRecord, Seque
 
 
 def _other_imu_notes(layout: Layout) -> list[str]:
-    """Say how to name a table that seems to be the IMU's and is not read by its name."""
+    """Say how to name tables that seem to be the IMU's and are not read by their names."""
     folders = dict.fromkeys((layout.root, layout.base))
-    files = [f for folder in folders for f in sorted(folder.glob("*[iI][mM][uU]*")) if f.is_file()]
-    found = [f for f in files if f.suffix.lower() in (".csv", ".txt") and holds_readings(f)]
-    return [f"{f}: not read; name it imu.csv if it is the IMU's" for f in found]
+    files = [f for folder in folders for f in sorted(folder.glob("*.[cCtT][sSxX][vVtT]"))]
+    found = {file: names_readings(file) for file in files if file.is_file()}
+    return [
+        f"{file}: not read; name it {wanted} if it is the IMU's"
+        for file, wanted in found.items()
+        if wanted is not None
+    ]
 
 
 def _read_reference(
@@ -356,6 +369,17 @@ def _read_reference(
         truth = truth_of_left(truth, rig)
     with naming(file):
         return reference_of_body(truth, rig, rectifier), file
+
+
+def _other_truth_notes(layout: Layout, read: Sequence[Path]) -> list[str]:
+    """Say how to name files of poses that are not read by their names."""
+    folders = dict.fromkeys((layout.root, layout.base))
+    files = [f for folder in folders for f in sorted(folder.glob("*.[tc][xus][tmv]"))]
+    return [
+        f"{file}: poses, not read; name it reference{file.suffix} if it is the ground truth"
+        for file in files
+        if file not in read and _NAMED_TRUTH.search(file.stem.lower()) and is_trajectory_file(file)
+    ]
 
 
 def reference_of_images(

@@ -29,7 +29,9 @@ from vio.files.text import text_lines
 from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
 from vio.records import NS_PER_S, IntArray
 
-_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "left_images.txt")
+_LEAST_LEFT_OUT = 10  # numbers between the last image and the first one of such a recording
+_LEAST_FULL = 999  # the largest number of a camera's counter has so many nines, or more
+TIME_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "left_images.txt")
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 _LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
 _TIMED = 100  # images, of which names that are times show it
@@ -203,7 +205,7 @@ def _own_times(files: ImageFiles, other: Path) -> IntArray | None:
     which is not that of the other camera's images; None: it has none.
     """
     folders = [f for f in (files.folder, files.folder.parent) if f not in (other, other.parent)]
-    named = (f / name for f in folders for name in (*_LISTS, "data.csv"))
+    named = (f / name for f in folders for name in (*TIME_LISTS, "data.csv"))
     file = next((file for file in named if file.is_file()), None)
     if file is None:
         return None
@@ -341,20 +343,53 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
     return counts * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
 
 
+def _left_files(pairs: ImagePairs) -> Sequence[Path]:
+    return pairs.left if isinstance(pairs, FilePairs) else [left for left, _ in pairs]
+
+
+def _numbers_of(files: Sequence[Path]) -> list[int | str]:
+    """Return the numbers in the names of images; the name where there is none."""
+    names = files.names if isinstance(files, ImageFiles) else [file.name for file in files]
+    stems = [stem_of(name) for name in names]
+    if all(map(str.isdecimal, stems)):
+        return list[int | str](map(int, stems))
+    return list(map(_last_number, files))
+
+
+def overflow_notes(pairs: ImagePairs) -> tuple[str, ...]:
+    """Doubt the order of images whose numbers begin at 0 or 1, end with nines alone, and leave a
+    part out: a camera's counter that began again amid a recording.
+    """
+    numbers = [number for number in _numbers_of(_left_files(pairs)) if isinstance(number, int)]
+    if len(numbers) < max(len(pairs), 2) or max(numbers) >= _LARGEST_COUNT:
+        return ()
+    ordered = np.sort(np.array(numbers, dtype=np.int64))
+    last = int(ordered[-1])
+    steps = np.diff(ordered)
+    gap = int(np.argmax(steps))
+    others = np.delete(steps, gap)
+    begun_again = (
+        last >= _LEAST_FULL
+        and set(str(last)) == {"9"}
+        and ordered[0] <= 1
+        and steps[gap] >= _LEAST_LEFT_OUT
+        and (others == 1).all()
+    )
+    if not begun_again:
+        return ()
+    return (
+        f"doubtful: images are numbered {ordered[0]} to {ordered[gap]} and {ordered[gap + 1]} to "
+        f"{last}: a camera whose counter began again at {ordered[0]} took the first of these last; "
+        f"rename them to go on from {last + 1}",
+    )
+
+
 def numbers_in_names(pairs: ImagePairs) -> IntArray | None:
     """Return the numbers (F,) by which left images are named where they count frames, that is
     increase and are no times; None: they do not.
     """
-    if isinstance(pairs, FilePairs):
-        files = pairs.left
-    else:
-        files = [left for left, _ in pairs]
-    names = files.names if isinstance(files, ImageFiles) else [file.name for file in files]
-    stems = [stem_of(name) for name in names]
-    if all(map(str.isdecimal, stems)):
-        numbers = list[int | str](map(int, stems))
-    else:
-        numbers = list(map(_last_number, files))
+    files = _left_files(pairs)
+    numbers = _numbers_of(files)
     counted = [number for number in numbers if isinstance(number, int)]
     if len(counted) < len(numbers) or max(counted, default=0) >= _LARGEST_COUNT:
         return None
@@ -388,7 +423,7 @@ def _frame_counts(files: Sequence[Path]) -> IntArray:
 def _file_of_times(layout: Layout) -> Path | None:
     """Return the list of times beside the images; None: there is none."""
     folders = dict.fromkeys((layout.base, layout.root, layout.left, layout.left.parent))
-    named = (folder / name for folder in folders for name in _LISTS)
+    named = (folder / name for folder in folders for name in TIME_LISTS)
     return next((file for file in named if file.is_file()), None)
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from vio.cameras.rig import Rig
 from vio.dataclass import dataclass
 from vio.datasets import rigs
+from vio.datasets.alternation import alternating_note
 from vio.datasets.companions import (
     ReadImages,
     calibration_beside,
@@ -40,6 +41,7 @@ from vio.datasets.image_times import (
     counted_apart,
     frame_times,
     numbers_in_names,
+    overflow_notes,
     pair_files,
     times_of,
 )
@@ -135,7 +137,10 @@ def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
     pair = first_pair(pairs)
     if pair is None:
         return None
-    return Layout(path, path, *(path / name for name in pair))
+    left, right = (path / name for name in pair)
+    # as where an archive was unpacked: what belongs to the images lies beside them
+    base = left.parent if left.parent == right.parent else path
+    return Layout(path, base, left, right)
 
 
 def side_by_side(path: Path, calibration: Path | None = None) -> Layout | None:
@@ -428,7 +433,9 @@ def read_mono(path: Path, settings: DatasetSettings) -> ImageDataset:
             "left/"
         )
     files = list_images(layout.left)
-    images = _Images(FilePairs(files, files), _empty_partner_note(layout))
+    doubt = alternating_note(len(files), lambda k: load_gray(files[k])[0])
+    notes = (*_empty_partner_note(layout), *((doubt,) if doubt is not None else ()))
+    images = _Images(FilePairs(files, files), notes)
     return _read("mono", layout, images, settings)
 
 
@@ -475,6 +482,7 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> ImageDataset:
 def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings) -> ImageDataset:
     """Read what goes with the images: calibration, times, motion samples and ground truth."""
     size, levels, notes = measured_images(images.pairs)
+    notes = (*notes, *_page_notes(images.pairs[0]), *overflow_notes(images.pairs))
     if images.side_by_side:
         size = (size[0] // 2, size[1])
         notes = (*notes, "each image holds the left and the right one side by side")
@@ -514,6 +522,21 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
     if found is None:
         return dataset
     return _read(kind, layout, _Images(found[0], (found[1],)), settings)
+
+
+def _page_notes(files: tuple[Path, Path]) -> tuple[str, ...]:
+    """Doubt images that hold several, of which the first one is read."""
+    for file in dict.fromkeys(files):
+        if file.suffix.lower() not in (".tif", ".tiff"):
+            continue
+        import cv2
+
+        if (count := cv2.imcount(str(file))) > 1:
+            return (
+                f"doubtful: {file} holds {count} images, of which the first one is read; write each "
+                "into a file of its own",
+            )
+    return ()
 
 
 def _file_and_rig(

@@ -44,8 +44,16 @@ _NUMBER = re.compile(
 _SECONDS = re.compile(r"(^|[^n])secs?$|seconds?$")  # ends of names in small letters
 _NANOSECONDS = re.compile(r"n(ano)?secs?$|nanoseconds?$")
 _PLAIN = re.compile(r"[0-9.eE+-]*")  # numbers in these are written as `_NUMBER` says, or are none
-_COUNTERS = ("", "id", "no", "num", "number", "index", "idx", "seq", "row", "line", "sample")
+# columns that number the IMUs of a flight controller
+_UNITS_OF_A_LOG = ("i", "instance", "imu_id", "imu", "device_id", "sensor_id")
+_TIME = re.compile(r"time|stamp|sec|\bt\b")  # in a cell of a header in small letters
+# of a time that is counted from another one
+_RELATIVE = re.compile(r"relative|elapsed|delta|offset")
+# of what is no reading, though it is called by one: covariances, rates, biases
+_NO_READING = re.compile(r"cov|hz$|integral|bias|std|sigma|clip")
+_INDEXED_AXIS = re.compile(r"[\[(]([012xyz])[\])]")
 _IMU_COLUMNS = 7
+_SENSOR_COLUMNS = 4  # of a gyro or an accelerometer alone
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
 _MAX_LATE = 0.05  # share of lines that may have been written late
 _OWN_PLACE = 0.5  # of the usual interval that is free on both sides of such a line
@@ -364,7 +372,7 @@ def read_sensor_table(
         DataError: a line lacks four finite numbers, or the stamps do not increase.
     """
     units, si = (GYRO_UNITS, "rad/s") if sensor == "gyro" else (ACCEL_UNITS, "m/s^2")
-    table = read_table(path, 4, f"timestamp, {sensor} x y z [{si}]", notes)
+    table = _sensor_table(path, f"timestamp, {sensor} x y z [{si}]", notes)
     times_ns, values = _readings(table, stamps_ns(table, SAMPLE_PACE, notes), notes)
     axes = [_sensor_and_axis(cell)[1] for cell in table.header[1:]]
     if sorted(axes) == ["x", "y", "z"]:
@@ -374,6 +382,17 @@ def read_sensor_table(
     factor, said = _factor(table, order, units, sensor, si)
     notes += said
     return times_ns, values[:, order] * factor
+
+
+def _sensor_table(path: Path, form: str, cut: list[str]) -> NumberTable:
+    """Read the stamps and three readings, or the axes that the header names of more columns."""
+    count = _columns(path)
+    if count > _SENSOR_COLUMNS:
+        table = _time_first(read_table(path, count, form, cut))
+        axes = [_sensor_and_axis(cell)[1] for cell in table.header[1:]]
+        if all(axes.count(axis) == 1 for axis in "xyz"):
+            return _columns_of(table, [k for k, axis in enumerate(axes) if axis])
+    return read_table(path, _SENSOR_COLUMNS, form, cut)
 
 
 def _readings(
@@ -407,12 +426,29 @@ def _without_gaps(
     return _rows(table, kept), times_ns[kept]
 
 
-def holds_readings(path: Path) -> bool:
-    """Return whether a file could be an IMU's by its first line of data."""
+def names_readings(path: Path) -> str | None:
+    """Return the name by which a file would be read that could be an IMU's by its own name, or by its
+    header, and by its first line of data; None: it could not.
+    """
+    name = path.name.lower()
     try:
-        return _columns(path) >= _IMU_COLUMNS
+        count = _columns(path)
+        if count >= _IMU_COLUMNS and ("imu" in name or _is_named_imu(path, count)):
+            return "imu.csv"
     except DataError:
-        return False
+        return None
+    if count < _SENSOR_COLUMNS:
+        return None
+    if "gyr" in name:
+        return "gyro.csv"
+    return "accel.csv" if "acc" in name else None
+
+
+def _is_named_imu(path: Path, count: int) -> bool:
+    """Return whether the header of a table names the axes of a gyro and of an accelerometer."""
+    header = next(table_rows(path, count, _IMU_FORM))[1]
+    named = {_sensor_and_axis(cell.lower()) for cell in header}
+    return named >= set(itertools.product("wa", "xyz"))
 
 
 def _columns(path: Path) -> int:
@@ -426,54 +462,82 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
     count = _columns(path)
     if count <= _IMU_COLUMNS:
         return read_table(path, _IMU_COLUMNS, _IMU_FORM, cut)
-    table = _joined_stamps(_without_counter(read_table(path, count, _IMU_FORM, cut)))
+    table = _of_one_unit(_time_first(read_table(path, count, _IMU_FORM, cut)), cut)
     order = _imu_order(table) if table.header else None
-    named = [bool(re.search(r"time|stamp|sec|\bt\b", cell)) for cell in table.header]
-    if any(named) and not named[0]:
-        raise DataError(
-            f"{path}: its first column, {table.header[0]!r}, is no time; write the time first"
-        )
     if order is None:
         raise DataError(
             f"{table.where(0)}: {count} values instead of {_IMU_COLUMNS} ({_IMU_FORM}); name the "
             "columns in a header, or write these seven"
         )
+    return _columns_of(table, order)
+
+
+def _of_one_unit(table: NumberTable, notes: list[str] | None) -> NumberTable:
+    """Return the rows of the first IMU where a column of their number says that there are several,
+    with a note.
+    """
+    numbered = [k for k, cell in enumerate(table.header[1:]) if cell in _UNITS_OF_A_LOG]
+    if not numbered:
+        return table
+    units = table.values[:, numbered[0]]
+    kept = np.flatnonzero(units == units[0])
+    count = len(np.unique(units))
+    if count > 1 and notes is not None:
+        notes.append(
+            f"{table.path}: holds {count} IMUs; the readings of number {units[0]:g} are used"
+        )
+    return _rows(table, kept)
+
+
+def _columns_of(table: NumberTable, columns: Sequence[int]) -> NumberTable:
+    """Return the stamps of a table and some of its other columns."""
     return replace(
         table,
-        header=(table.header[0], *(table.header[1 + k] for k in order)),
-        values=table.values[:, order],
+        header=(table.header[0], *(table.header[1 + k] for k in columns)),
+        values=table.values[:, columns],
     )
 
 
-def _without_counter(table: NumberTable) -> NumberTable:
-    """Return a table without the first column where its header calls it a counter of the lines, and
-    the second one the time.
+def _time_first(table: NumberTable) -> NumberTable:
+    """Return a table whose stamps are the column that its header calls the time, or the seconds and
+    nanoseconds of two columns; as it is where the header names none.
+
+    The stamp of a message goes before that of its recording, an absolute time before others.
     """
-    names = [re.sub(r"[^a-z]", "", cell) for cell in table.header[:2]]
-    if len(names) < 2 or names[0] not in _COUNTERS or not re.search(r"time|stamp", names[1]):
+    times = [k for k, cell in enumerate(table.header) if _TIME.search(cell)]
+    if not times:
+        return table
+    stamp = min(times, key=lambda k: _rank_of_time(table.header[k]))
+    names = [re.sub(r"[^a-z]", "", cell) for cell in table.header[stamp:][:2]]
+    rest = stamp + 1
+    in_parts = (
+        len(names) > 1
+        and _SECONDS.search(names[0]) is not None
+        and _NANOSECONDS.search(names[1]) is not None
+    )
+    if stamp == 0 and not in_parts:
         return table
     # their digits, of which numbers keep sixteen
     rows = itertools.islice(table_rows(table.path, len(table.header), _IMU_FORM, []), 1, None)
-    stamps = tuple(fields[1] for _, fields in rows)
-    return replace(table, header=table.header[1:], stamps=stamps, values=table.values[:, 1:])
+    cells = [(fields[stamp], fields[rest] if in_parts else "0") for _, fields in rows]
+    header = table.header[stamp]
+    stamps = tuple(whole for whole, _ in cells)
+    if in_parts and all(part.isdigit() for pair in cells for part in pair):
+        header = "time [ns]"
+        stamps = tuple(str(int(whole) * NS_PER_S + int(part)) for whole, part in cells)
+    others = [k for k in range(1, len(table.header)) if k != stamp and not (in_parts and k == rest)]
+    return replace(
+        table,
+        header=(header, *(table.header[k] for k in others)),
+        stamps=stamps,
+        values=table.values[:, [k - 1 for k in others]],
+    )
 
 
-def _joined_stamps(table: NumberTable) -> NumberTable:
-    """Return a table whose header names seconds and nanoseconds in its first two columns with one
-    time, in nanoseconds; others as they are.
-    """
-    names = [re.sub(r"[^a-z]", "", cell) for cell in table.header[:2]]
-    if len(names) < 2 or not (_SECONDS.search(names[0]) and _NANOSECONDS.search(names[1])):
-        return table
-    nanoseconds = table.values[:, 0]
-    if not all(map(str.isdigit, table.stamps)) or not np.isfinite(nanoseconds).all():
-        return table
-    joined = [
-        str(int(whole) * NS_PER_S + int(rest))
-        for whole, rest in zip(table.stamps, nanoseconds.tolist(), strict=True)
-    ]
-    header = ("time [ns]", *table.header[2:])
-    return replace(table, header=header, stamps=tuple(joined), values=table.values[:, 1:])
+def _rank_of_time(cell: str) -> tuple[bool, bool]:
+    """Return by what times of one row are chosen, the least one first."""
+    letters = re.sub(r"[^a-z]", "", cell)
+    return _RELATIVE.search(letters) is not None, "headerstamp" not in letters
 
 
 def _factor(
@@ -548,6 +612,11 @@ def _imu_order(table: NumberTable) -> Sequence[int] | None:
 def _sensor_and_axis(cell: str) -> tuple[str, str]:
     """Return the sensor and the axis that a cell of a header names; empty where it names none."""
     letters = re.sub(r"[^a-z]", "", without_unit(cell)).replace("axis", "")
+    if _NO_READING.search(letters):
+        return "", ""
+    indexed = _INDEXED_AXIS.search(cell)
+    if indexed is not None:
+        return _sensor(letters), dict(zip("012", "xyz", strict=True)).get(indexed[1], indexed[1])
     axis = next((c for c in reversed(letters) if c in "xyz"), "")
     return _sensor(letters), axis
 

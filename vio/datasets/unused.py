@@ -114,6 +114,37 @@ ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".xz", ".bz2", ".zst",
 _OTHER_IMAGES = (".jp2", ".j2k", ".gif", ".heic", ".avif", ".jxl", ".exr", ".dng", ".raw", ".npy")
 
 
+# recordings of other programs: what they are, and what to do
+_STREAM = (
+    "a stream of images without times",
+    "pack it with its frame rate (ffmpeg -framerate RATE -i FILE -c copy left.mp4)",
+)
+_SURROUND = ("a video of several lenses", "export one mp4 a lens, left.mp4 and right.mp4")
+_FOREIGN: dict[str, tuple[str, str]] = {
+    **dict.fromkeys((".h264", ".264", ".h265", ".265", ".hevc", ".mjpeg", ".mjpg"), _STREAM),
+    **dict.fromkeys((".insv", ".360", ".lrv"), _SURROUND),
+    **dict.fromkeys(
+        (".svo", ".svo2"),
+        ("a recording of ZED's SDK", "export its left and right images with that SDK"),
+    ),
+    ".vrs": ("a VRS file", "extract its images and its IMU (vrs extract-all)"),
+    ".ulg": ("a log of PX4", "write its IMU as a table (ulog2csv), named imu.csv"),
+    ".db": ("a database, as of RTAB-Map", "export its images and calibration with that program"),
+    **dict.fromkeys(
+        (".h5", ".hdf5"), ("an HDF5 file", "write its images as files and its IMU as imu.csv")
+    ),
+}
+
+
+def foreign_file(path: Path) -> str | None:
+    """Say what a file of another program is, and what to do with it; None: it is not known."""
+    found = _FOREIGN.get(path.suffix.lower())
+    if found is None or path.name.startswith(".") or path.name.lower() == "thumbs.db":
+        return None
+    what, remedy = found
+    return f"{path}: is {what}, which is not read; {remedy}"
+
+
 def unread_files(path: Path) -> str | None:
     """Say what to do with archives, or with images of another form, which a path is or a folder and
     the folders in it hold; None: there are none.
@@ -129,6 +160,9 @@ def unread_files(path: Path) -> str | None:
             "; of a ROS 2 bag, its folder with metadata.yaml is read as it is" if inside else ""
         )
         return f"{archive}: is an archive; unpack it, and give what it holds{folder}"
+    foreign = next(filter(None, map(foreign_file, sorted(files))), None)
+    if foreign is not None:
+        return foreign
     counts = Counter(file.suffix.lower() for file in files)
     suffix = max(_OTHER_IMAGES, key=lambda suffix: counts[suffix])
     if not counts[suffix]:

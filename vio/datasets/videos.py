@@ -12,7 +12,8 @@ together that have one time.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator, Sequence
+import itertools
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,11 +21,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vio.cameras.rig import Rig
+from vio.datasets.alternation import alternating_note
 from vio.datasets.companions import ReadImages, find_calibration_of, read_companions
 from vio.datasets.frame_times import nearest
 from vio.datasets.image_pairs import ImageRecording, half_of
-from vio.datasets.image_times import times_of
-from vio.datasets.images import prefetch
+from vio.datasets.image_times import TIME_LISTS, times_of
+from vio.datasets.images import UnreadableImageError, prefetch
 from vio.datasets.reader import Reader
 from vio.datasets.rigs import load_rig
 from vio.datasets.settings import DatasetSettings
@@ -126,12 +128,32 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
 def _check_side_by_side(rig: Rig, video: _Facts, path: Path, calibration: Path) -> None:
     """Raise DataError where a calibration is not of half the width of a single video."""
     if (rig.cam0.width, rig.cam0.height) != (video.width // 2, video.height):
+        doubt = alternating_note(video.count, _loader(path))
         raise DataError(
             f"{path} is the only video, of {video.width} x {video.height} pixels, and "
             f"{calibration} is for images of {rig.cam0.width} x {rig.cam0.height}; side by side "
             "they would have twice that width; give left.mp4 and right.mp4, or the calibration of "
-            "these images"
+            f"these images{'' if doubt is None else f'; {doubt}'}"
         )
+
+
+def _loader(file: Path) -> Callable[[int], Image]:
+    """Return what decodes a frame of a video by its number, in increasing order."""
+    import cv2
+
+    capture = cv2.VideoCapture(str(file))
+    decoded = itertools.count()
+
+    def load(frame: int) -> Image:
+        for k in decoded:
+            found, image = capture.read()
+            if not found:
+                raise UnreadableImageError(f"{file}: frame {k} cannot be decoded")
+            if k == frame:
+                return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+        raise AssertionError("numbers do not end")
+
+    return load
 
 
 def _facts(file: Path) -> _Facts:
@@ -198,7 +220,8 @@ def _times(
         if left.count != right.count
         else []
     )
-    if (file := path / "times.txt").is_file():
+    lists = (path / name for name in TIME_LISTS)
+    if (file := next((file for file in lists if file.is_file()), None)) is not None:
         names = [(Path(f"{k}"), Path(f"{k}")) for k in range(count)]
         doubts = list[str]()
         times_ns = times_of(file, tuple(names), doubts)

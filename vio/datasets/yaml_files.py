@@ -31,7 +31,7 @@ NOISE_UNITS = {
 }
 # 'data:[1, 2]' and 'Viewer.PointSize:2', which OpenCV's reader takes for 'key: value'
 _LAX_KEY = re.compile(r"^(\s*(?:- )?[A-Za-z_][\w.\-]*):(?=[^\s:/\\])", re.MULTILINE)
-_MAX_BYTES = 1_000_000  # a calibration is some kilobytes; a larger file is another one
+MAX_BYTES = 1_000_000  # a calibration is some kilobytes; a larger file is another one
 
 
 def read_yaml_file(path: Path, what: str = "the sensor's calibration") -> dict[str, object]:
@@ -42,7 +42,7 @@ def read_yaml_file(path: Path, what: str = "the sensor's calibration") -> dict[s
     """
     if not path.is_file():
         raise CalibrationError(f"{path} is missing; it holds {what}")
-    if (size := path.stat().st_size) > _MAX_BYTES:
+    if (size := path.stat().st_size) > MAX_BYTES:
         raise CalibrationError(
             f"{path}: {size} bytes are too many for a calibration; give the right file"
         )
@@ -89,7 +89,7 @@ def read_json_file(path: Path) -> dict[str, object]:
     Raises:
         CalibrationError: the file is missing, too large, or no JSON object.
     """
-    if not path.is_file() or path.stat().st_size > _MAX_BYTES:
+    if not path.is_file() or path.stat().st_size > MAX_BYTES:
         raise CalibrationError(f"{path}: is missing or too large for a calibration")
     try:
         entries = json.loads("\n".join(line for _, line in text_lines(path)))

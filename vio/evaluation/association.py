@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from vio.dataclass import dataclass
 from vio.errors import EvaluationError
+from vio.files.epochs import epoch_hint
 from vio.records import NS_PER_S, IntArray, Trajectory
 
 AssociationMode: TypeAlias = Literal["time", "frame"]
@@ -162,11 +163,13 @@ def _no_common_time(estimate_ns: IntArray, reference_ns: IntArray, limit_s: floa
     spans = [
         f"{t[0] / NS_PER_S:.3f} to {t[-1] / NS_PER_S:.3f} s" for t in (estimate_ns, reference_ns)
     ]
+    own, other = ((int(t[0]), int(t[-1])) for t in (estimate_ns, reference_ns))
+    apart = own[1] < other[0] or other[1] < own[0]
     return (
         f"no poses within {limit_s:g} s of each other: the estimate covers {spans[0]}, the "
         f"reference {spans[1]}, "
         f"closest pair {nearest.min() / NS_PER_S:.6g} s; check the clocks or allow a larger "
-        "difference"
+        f"difference{epoch_hint(own, other, 'the reference') if apart else ''}"
     )
 
 

@@ -1,5 +1,5 @@
 """What makes the positions of a reference differ from an estimate of the same motion: a clock that
-is apart, axes that are left-handed.
+is apart, axes that are left-handed, inverse poses, poses that are placeholders.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, se3_inverse
 from vio.numerics.kinds import Tolerance
 from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
@@ -24,6 +24,7 @@ class _FaultRules(NamedTuple):
     overlap: float = 0.5  # share of the poses that must have a reference at a shift
     steps: int = 200  # of the first search, on either side
     finer: int = 10  # steps on either side of the best one, twice
+    min_jump_m: float = 0.01  # to the identity: below, a body may stand at its start
 
 
 _FAULT = _FaultRules()
@@ -45,6 +46,8 @@ def position_fault(
         T_est: (M, 4, 4) poses that were paired.
         T_ref: (M, 4, 4) the poses of the reference.
     """
+    if (lost := _placeholders(estimate)) is not None:
+        return lost
     x = T_est[:, :3, 3]
     y = T_ref[:, :3, 3]
     if len(x) < _FAULT.min_poses:
@@ -60,7 +63,39 @@ def position_fault(
             f"{mirrored_m:.3g} m, {error_m:.3g} m without): its axes are left-handed, as those of some "
             "simulators; change the sign of one of them"
         )
+    if "none" not in (estimate.orientations, reference.orientations):
+        inverse_m = float(_errors(se3_inverse(T_est)[:, :3, 3], y)[0])
+        if inverse_m < _FAULT.explained * error_m:
+            return (
+                "the positions agree where the poses of one of the two are inverted (ATE after Sim(3) "
+                f"{inverse_m:.3g} m, {error_m:.3g} m without): one file has the world in the body, as "
+                "some programs write, and the other the body in the world; invert its poses"
+            )
     return _clock_fault(estimate, reference)
+
+
+def _placeholders(estimate: Trajectory) -> str | None:
+    """Return the note on poses that are the identity to the bit amid others that are not; None:
+    there are none.
+
+    Where a body stands at its start they are the first ones.
+    """
+    alike = (estimate.T_world_body == np.eye(4)).all(axis=(1, 2))
+    others = np.flatnonzero(~alike)
+    if not len(others):
+        return None
+    lost = int(alike[others[0] :].sum())
+    first = int(others[0]) + int(np.argmax(alike[others[0] :]))
+    if not lost:
+        return None
+    jump_m = float(np.linalg.norm(estimate.positions[first - 1]))
+    if jump_m < _FAULT.min_jump_m:
+        return None
+    return (
+        f"{lost} poses of the estimate, from row {first} on, are the identity to the bit, {jump_m:.3g} m "
+        "from the one before: placeholders of frames without a pose, as some programs write where "
+        "they are lost; remove these rows"
+    )
 
 
 def _clock_fault(estimate: Trajectory, reference: Trajectory) -> str | None:

@@ -204,10 +204,10 @@ def evaluate(
             f"{reference.body}, whose world frames differ; take align first, or se3"
         )
     estimate, reference, order_notes = settled_orders(estimate, reference, max_time_difference_s)
-    moved = _in_frame_of(estimate, reference, T_cam0_imu)
     association, rows, reference_rows = associate(
-        moved, reference, max_time_difference_s=max_time_difference_s
+        estimate, reference, max_time_difference_s=max_time_difference_s
     )
+    moved = _in_frame_of(estimate, reference, T_cam0_imu)
     T_est = moved.T_world_body[rows]
     T_ref = reference.T_world_body[reference_rows]
     closest = align_poses(T_est, T_ref, align)

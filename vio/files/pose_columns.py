@@ -22,6 +22,8 @@ _POSITION = re.compile(
     r"[a-z]*(?:position|translation)([xyz])"
 )
 _OTHER = re.compile(r"^(?:v|b|w|a|g|om|ang|lin|gyr|acc|std|cov|sig|euler|roll|pitch|yaw)")
+# a component with the names of its frames behind, as tx_world_device
+_OF_FRAMES = re.compile(r"([tpq][xyzw])_[a-z]+_[a-z]+")
 _SPELT = re.compile(r"\b(?:w[ ,]*x[ ,]*y[ ,]*z|x[ ,]*y[ ,]*z[ ,]*w)\b", re.IGNORECASE)
 _WORDS = re.compile(r"[A-Za-z_][A-Za-z_0-9.]*")
 
@@ -101,7 +103,7 @@ def _stated_unit(headers: Sequence[str], named: Sequence[Sequence[str]]) -> str 
 
 def _named_columns(cells: Sequence[str]) -> PoseColumns | None:
     """Return the columns that a header names; None: it does not name quaternion and position."""
-    names = [re.sub(r"[^a-z]", "", without_unit(cell)) for cell in cells]
+    names = [_name_of(without_unit(cell)) for cell in cells]
     quaternion = _components(names, _QUATERNION, "xyzw")
     if quaternion is None:
         return None
@@ -116,6 +118,12 @@ def _named_columns(cells: Sequence[str]) -> PoseColumns | None:
     if names[stamp] in ("sec", "secs", "seconds") and "nsec" in names[after : after + 1]:
         return PoseColumns(stamp, (a, b, c), (x, y, z, w), "stated", "s", after)
     return PoseColumns(stamp, (a, b, c), (x, y, z, w), "stated", time_unit(cells[stamp]))
+
+
+def _name_of(cell: str) -> str:
+    """Return the letters of a column's name, without the names of frames behind a component."""
+    of_frames = _OF_FRAMES.fullmatch(cell.strip())
+    return re.sub(r"[^a-z]", "", cell if of_frames is None else of_frames[1])
 
 
 def _stamp_column(names: Sequence[str]) -> int:

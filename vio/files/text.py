@@ -131,6 +131,10 @@ def seconds_text(time_ns: int) -> str:
     return f"{'-' if time_ns < 0 else ''}{whole}.{remainder:09d}"
 
 
+# of what a counter holds, between its last and its next stamp
+_NEAR_OVERFLOW = 0.01
+
+
 def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> IntArray:
     """Check that times (N,) in nanoseconds strictly increase, and return them.
 
@@ -155,10 +159,24 @@ def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> In
             f"{repeated} of {len(times)} times repeat the one before, as times do that are written "
             "with too few digits; write all their digits"
             if repeated > 1 + _ROUNDED * len(times)
-            else "remove or reorder that entry"
+            else _overflowed(int(times[k - 1] - times[k])) or "remove or reorder that entry"
         )
         raise DataError(f"{where(k)}: the clock {what} ({now} s after {before} s); {remedy}")
     return times
+
+
+def _overflowed(back_ns: int) -> str | None:
+    """Return the remedy where a clock goes back by what a counter of 32 bits holds; None: it does
+    not.
+    """
+    units = {"milliseconds": 10**6, "microseconds": 10**3, "nanoseconds": 1}
+    for unit, unit_ns in units.items():
+        whole_ns = unit_ns << 32
+        if abs(back_ns - whole_ns) < _NEAR_OVERFLOW * whole_ns:
+            return (
+                f"a counter of 32 bits begins again there: add 2^32 {unit} to it and what follows"
+            )
+    return None
 
 
 def whole_ns_stamps(

@@ -45,6 +45,10 @@ _MIN_COLUMNS = 4  # a stamp and a position
 _POSE_COLUMNS = 8
 _KITTI_COLUMNS = 12
 _WHOLE_COLUMNS = 16  # of KITTI's form with the last row of each pose, 0 0 0 1
+# of KITTI-360's poses of the IMU, and of cam0: with the number of the frame, or a time, in front
+_LED_COLUMNS: dict[int, BodyFrame] = {_KITTI_COLUMNS + 1: "imu", _WHOLE_COLUMNS + 1: "cam0"}
+_MATRIX_COLUMNS = (_KITTI_COLUMNS, _WHOLE_COLUMNS, *_LED_COLUMNS)
+_GRAPH = re.compile(r"(?:VERTEX|EDGE|PARAMS)[_A-Z0-9]*(?::\w+)? ")
 _WHOLE = re.compile(r"[+-]?\d+")
 
 
@@ -52,6 +56,7 @@ class _PoseRules(NamedTuple):
     """What a pose of a file may be."""
 
     max_coordinate_m: float = 1e12  # of a coordinate, in metres: beyond, squares overflow
+    max_frame_number: int = 10_000_000  # whole numbers beyond are times
     exact_deviation: Tolerance[float] = 1e-12  # rotations this close to orthonormal keep their bits
 
 
@@ -117,7 +122,8 @@ def read_trajectory(
 ) -> Trajectory:
     """Read a trajectory; the format is detected from the content unless given.
 
-    A KITTI file describes cam0 and has no times; an EuRoC file describes the IMU; a TUM file
+    A KITTI file describes cam0 and has no times; KITTI-360's have the number of the frame (or a time)
+    before 12 numbers of the IMU's pose, or 16 of cam0's; an EuRoC file describes the IMU; a TUM file
     describes the frame of its comment `# body: imu` or `# body: cam0`, else the IMU. `body`
     overrides all of these. A header may name the columns, in any order and among others, and the
     unit of the stamps. Where it does not, a quaternion has w first between commas and last between
@@ -139,13 +145,15 @@ def read_trajectory(
     kind = fmt or _detect(table)
     _check_columns(table, kind, as_requested=fmt is not None)
     if kind == "kitti":
-        return Trajectory(_kitti_poses(table), None, body or _DEFAULT_BODY[kind])
+        return _matrices(table, body)
     if are_geographic(table.comments):
         raise DataError(
             f"{table.path}: its header names latitude and longitude, which are no metres; give "
             "positions in metres, as a local frame of east, north and up has them"
         )
+    table = _without_repeats(table)
     columns = pose_columns(table.comments, len(table.fields(0)), w_first=kind == "euroc")
+    table = _without_lost(table, columns)
     times_ns = _times_ns(table, columns, kind)
     poses, orientations = _quaternion_poses(table, columns, kind)
     comments = table.comments if kind == "tum" else []
@@ -156,6 +164,63 @@ def read_trajectory(
         poses, times_ns, _body(table, header_body, body) or _DEFAULT_BODY[kind], numbers
     )
     return _with_orientations(table, trajectory, orientations, columns.orientations)
+
+
+def _without_repeats(table: _Table) -> _Table:
+    """Return a table without rows that repeat the one above, with a warning."""
+    kept = [k for k, row in enumerate(table.rows) if not k or row != table.rows[k - 1]]
+    repeated = len(table.rows) - len(kept)
+    if repeated:
+        logger.warning("%s: %d rows repeat the one above and are left out", table.path, repeated)
+    return _some_rows(table, kept)
+
+
+def _without_lost(table: _Table, columns: PoseColumns) -> _Table:
+    """Return a table without poses none of whose numbers is one, as where a camera system lost the
+    body, with a warning; where most are such, more is wrong.
+    """
+    cells = (*columns.position, *(columns.quaternion or ()))
+    last = max(cells) + 1
+    kept = []
+    for k in range(len(table.rows)):
+        fields = table.fields(k, last)
+        if not all(fields[cell].strip().lower() == "nan" for cell in cells):
+            kept.append(k)
+    lost = len(table.rows) - len(kept)
+    if not 0 < lost < len(kept):
+        return table
+    logger.warning("%s: %d poses are not numbers and are left out", table.path, lost)
+    return _some_rows(table, kept)
+
+
+def _some_rows(table: _Table, kept: Sequence[int]) -> _Table:
+    return replace(
+        table,
+        rows=[table.rows[k] for k in kept],
+        line_numbers=[table.line_numbers[k] for k in kept],
+    )
+
+
+def _matrices(table: _Table, body: BodyFrame | None) -> Trajectory:
+    """Return poses that are written as matrices, with the numbers of frames or the times that stand
+    before them.
+    """
+    count = len(table.fields(0))
+    if count not in _LED_COLUMNS:
+        return Trajectory(_kitti_poses(table, 0), None, body or _DEFAULT_BODY["kitti"])
+    poses = _kitti_poses(table, 1)
+    stamps = table.column(0)
+    trajectory = Trajectory(poses, None, body or _LED_COLUMNS[count])
+    whole = all(_WHOLE.fullmatch(stamp) for stamp in stamps)
+    if whole and abs(int(stamps[-1])) < _POSES.max_frame_number:
+        numbers = np.array([int(stamp) for stamp in stamps], dtype=np.int64)
+        back = np.flatnonzero(np.diff(numbers) <= 0)
+        if len(back) or numbers[0] < 0:
+            table.fail(
+                int(back[0]) + 1 if len(back) else 0, "the numbers of frames do not increase"
+            )
+        return replace(trajectory, frame_indices=numbers)
+    return replace(trajectory, times_ns=parse_stamps(stamps, table.where, None, pace=POSE_PACE))
 
 
 def _with_orientations(
@@ -394,7 +459,12 @@ def _detect(table: _Table) -> TrajectoryFormat:
         return "euroc"
     n = len(table.fields(0))
     named = _names_poses(table, n)
-    kitti = n in (_KITTI_COLUMNS, _WHOLE_COLUMNS)
+    kitti = n in _MATRIX_COLUMNS
+    if _GRAPH.match(table.rows[0]):
+        raise DataError(
+            f"{table.path}: is a graph of poses (g2o, TORO), which have no times; write them as "
+            f"TUM form, {_COLUMNS['tum']}"
+        )
     if n not in (_MIN_COLUMNS, _POSE_COLUMNS) and not (named or kitti):
         forms = "; ".join(f"{kind}: {columns}" for kind, columns in _COLUMNS.items())
         table.fail(0, f"{n} columns fit no known format ({forms})")
@@ -414,7 +484,7 @@ def _check_columns(table: _Table, kind: TrajectoryFormat, *, as_requested: bool)
     expected = {"tum": _POSE_COLUMNS, "kitti": _KITTI_COLUMNS, "euroc": max(count, _POSE_COLUMNS)}[
         kind
     ]
-    if kind == "kitti" and count == _WHOLE_COLUMNS:
+    if kind == "kitti" and count in _MATRIX_COLUMNS:
         expected = count
     if kind != "kitti" and (
         count == _MIN_COLUMNS or (not as_requested and _names_poses(table, count))
@@ -488,16 +558,18 @@ def _quaternion_poses(
     return se3_from_parts(rotation_from_quat_xyzw(q_xyzw), p), known
 
 
-def _kitti_poses(table: _Table) -> FloatArray:
-    if len(table.fields(0)) == _WHOLE_COLUMNS:
-        last = _floats(table, range(_KITTI_COLUMNS, _WHOLE_COLUMNS))
+def _kitti_poses(table: _Table, first: int) -> FloatArray:
+    """Return the poses whose matrices begin in a column."""
+    behind = first + _KITTI_COLUMNS
+    if len(table.fields(0)) == first + _WHOLE_COLUMNS:
+        last = _floats(table, range(behind, first + _WHOLE_COLUMNS))
         wrong = (last != [0.0, 0.0, 0.0, 1.0]).any(axis=1)
         if wrong.any():
             table.fail(
                 int(np.argmax(wrong)),
                 f"the last of {_WHOLE_COLUMNS} columns are not 0 0 0 1, as of a 4x4 pose row by row",
             )
-    values = _floats(table, range(_KITTI_COLUMNS)).reshape(-1, 3, 4)
+    values = _floats(table, range(first, behind)).reshape(-1, 3, 4)
     R = values[:, :, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))

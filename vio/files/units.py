@@ -153,7 +153,7 @@ def factor_in_words(comments: Iterable[str], units: Mapping[str, float]) -> floa
 def unknown_unit(cell: str, units: Mapping[str, float]) -> str | None:
     """Return what stands in a cell's brackets and is none of these units; None: nothing."""
     words = _in_brackets(cell)
-    unknown = [word for word in words if word and word not in units and word not in "xyz"]
+    unknown = [word for word in words if word and word not in units and word not in "xyz012"]
     return unknown[0] if unknown else None
 
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vio.files.epochs import epoch_hint
 from vio.imu.findings import InertialFinding
 from vio.records import S_PER_NS, IntArray
 
@@ -132,7 +133,8 @@ def _no_overlap(
         seen,
         f"{same}the clocks may have different epochs (the IMU starts {offset_s:+.3f} s from the "
         "frames), or the "
-        "files belong to other recordings; convert the IMU's stamps to the camera's clock",
+        "files belong to other recordings; convert the IMU's stamps to the camera's clock"
+        f"{epoch_hint(frames, imu, 'the IMU')}",
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from vio.calibration.severity import StereoError
 from vio.datasets.samples import motion_samples
 from vio.errors import DataError
+from vio.files.epochs import epoch_hint
 from vio.filters.stereo_calibration import VerticalDisparityModel
 from vio.findings import Finding
 from vio.geometry.rectify import field_of_view
@@ -337,9 +338,15 @@ def _reference_part(recording: Recording, times: IntArray) -> Part:
     if truth.times_ns is None:
         return Part("ground truth", text, {"poses": len(truth)})
     covered = float(np.mean((times >= truth.times_ns[0]) & (times <= truth.times_ns[-1])))
-    return Part(
-        "ground truth", f"{text}, over {100 * covered:.0f} % of the frames", {"poses": len(truth)}
-    )
+    text += f", over {100 * covered:.0f} % of the frames"
+    if covered == 0.0:
+        own = int(times[0]), int(times[-1])
+        other = int(truth.times_ns[0]), int(truth.times_ns[-1])
+        text += (
+            f": of another clock or recording; it begins {(other[0] - own[0]) / NS_PER_S:+.3f} s from the "
+            f"frames{epoch_hint(own, other, 'the ground truth')}"
+        )
+    return Part("ground truth", text, {"poses": len(truth)})
 
 
 def _missing_part(recording: Recording) -> Part:

@@ -176,19 +176,21 @@ class RunHealth:
         is off.
         """
         field = estimate.stereo_field
-        if (
-            field is None
-            or "stereo" in self._reported
-            or rows_grade(field.rows_rms_px) == "negligible"
-        ):
+        if field is None or rows_grade(field.rows_rms_px) == "negligible":
             return []
-        self._reported.add("stereo")
+        other_pair = field.rows_rms_px > _RIG.other_pair_px
+        # what begins as a small error may come out as that of another pair
+        said = "other pair" if other_pair else "stereo"
+        if said in self._reported:
+            return []
+        self._reported |= {"stereo", said}
         seen = f"frame {index}: the rows of left and right images differ"
         figures = {"rows_rms_px": field.rows_rms_px}
-        if field.rows_rms_px > _RIG.other_pair_px:
+        if other_pair:
             message = (
                 f"{seen} by {field.rows_rms_px:.2f} px (rms): left and right are exchanged, the "
-                "calibration is not that of these images, or a camera was moved; `vio calibrate` "
+                "calibration is not that of these images (as of rectified ones, where they are "
+                "raw), or a camera was moved; `vio calibrate` "
                 "finds which; what the calibration is off by is estimated while running, which may "
                 "not suffice (msckf.calibrate_stereo)"
             )

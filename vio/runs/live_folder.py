@@ -23,7 +23,7 @@ import numpy as np
 
 from vio.cameras.rig import Rig
 from vio.config import Config, load_config
-from vio.errors import CalibrationError, DataError
+from vio.errors import NOTE, CalibrationError, DataError
 from vio.files.atomic import atomic_write_text, check_writable, locked_folder
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
@@ -377,6 +377,7 @@ class _Trajectory:
             result = _result(self._config, state, self.recorder, end)
             self.recorder.close()
             _write(self._folder, result, settings.save_observations, settings.command, plot=plot)
+        log.log(NOTE, "the results are in %s", self._folder)
 
     def _stated(self, findings: tuple[Finding, ...], last: int) -> _LiveState:
         """Return what is known beside the tables, up to the frame of a number."""

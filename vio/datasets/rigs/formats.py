@@ -45,7 +45,7 @@ from vio.datasets.rigs.four_seasons import is_four_seasons, read_four_seasons
 from vio.datasets.rigs.kalibr import is_camchain, read_camchain
 from vio.datasets.rigs.kimera import pair_beside, read_kimera
 from vio.datasets.rigs.kitti_odometry import kitti_rig
-from vio.datasets.rigs.middlebury import is_middlebury, read_middlebury
+from vio.datasets.rigs.middlebury import read_middlebury
 from vio.datasets.rigs.names import named_calibration
 from vio.datasets.rigs.opencv import is_opencv, read_arrays, read_entries, rig_from_opencv
 from vio.datasets.rigs.plausible import checked_rig
@@ -203,9 +203,8 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
 def _read_txt(path: Path, image_size: Size | None) -> Rig:
     if bare.is_bare(path):
         return bare.read_bare(path, image_size)
-    if is_middlebury(path):
-        return read_middlebury(path, image_size)
-    return kitti_rig(path, image_size)[0]
+    rig = read_middlebury(path, image_size)
+    return kitti_rig(path, image_size)[0] if rig is None else rig
 
 
 def _is_sensor_sheet(entries: Entries) -> bool:

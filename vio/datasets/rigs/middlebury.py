@@ -25,18 +25,15 @@ _MM = 1e-3
 _ENTRY = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*")
 
 
-def is_middlebury(path: Path) -> bool:
-    """Return whether a text file states `cam0`, `cam1` and `baseline` as Middlebury's."""
-    return {"cam0", "cam1", "baseline"} <= _entries(path).keys()
-
-
-def read_middlebury(path: Path, size: Size | None) -> Rig:
-    """Read the pair.
+def read_middlebury(path: Path, size: Size | None) -> Rig | None:
+    """Read the pair; None: the text file does not state `cam0`, `cam1` and `baseline`.
 
     Raises:
         CalibrationError: an entry is malformed, or no image size is stated or given.
     """
     entries = _entries(path)
+    if not {"cam0", "cam1", "baseline"} <= entries.keys():
+        return None
     stated = "width" in entries and "height" in entries
     if not stated and size is None:
         raise no_image_size(path)

@@ -20,7 +20,14 @@ import numpy as np
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import naming
 from vio.datasets.rigs.plausible import checked_rig, unit_doubt
-from vio.datasets.yaml_files import Entries, as_number, lens_model, matrix, read_yaml_file
+from vio.datasets.yaml_files import (
+    MAX_BYTES,
+    Entries,
+    as_number,
+    lens_model,
+    matrix,
+    read_yaml_file,
+)
 from vio.errors import CalibrationError
 from vio.files.printable import printable
 from vio.geometry.distortion import DistortionModel
@@ -324,7 +331,7 @@ def read_xml(path: Path) -> ElementTree.Element:
         raise CalibrationError(
             f"cannot read {path}: {error.strerror or error}; give a readable file"
         ) from error
-    if b"<!ENTITY" in text or len(text) > 1_000_000:
+    if b"<!ENTITY" in text or len(text) > MAX_BYTES:
         raise CalibrationError(
             f"{path}: declares entities or is too large for a calibration; give the original file"
         )

@@ -1,0 +1,132 @@
+"""IMU tables with the columns of flight controllers, phones and message loggers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.plain_maker import make_plain
+from vio.datasets import open_dataset
+from vio.datasets.image_pairs import ImageDataset
+from vio.datasets.tables import names_readings
+from vio.records import ImuSample
+
+Row = tuple[int, np.ndarray]  # time in nanoseconds, gyro and accel (6,)
+
+
+def _samples(folder: Path) -> list[Row]:
+    dataset = open_dataset(folder)
+    assert isinstance(dataset, ImageDataset)
+    samples = [sample for sample in dataset.motion if isinstance(sample, ImuSample)]
+    return [(e.time_ns, np.array([*e.gyro, *e.accel])) for e in samples]
+
+
+def _text(header: str, rows: list[Row], cells: Callable[[int, list[str]], list[str]]) -> str:
+    lines = [",".join(cells(t, [repr(float(x)) for x in values])) for t, values in rows]
+    return "\n".join([header, *lines]) + "\n"
+
+
+def _echoed(t: int, v: list[str]) -> list[str]:
+    covariance = ["0"] * 3
+    return [str(t + 7), "3", str(t), "imu_link", *v[:3], *covariance, *v[3:], *covariance]
+
+
+ECHOED = ",".join(
+    [
+        "%time,field.header.seq,field.header.stamp,field.header.frame_id",
+        *(f"field.angular_velocity.{axis}" for axis in "xyz"),
+        *(f"field.angular_velocity_covariance{k}" for k in range(3)),
+        *(f"field.linear_acceleration.{axis}" for axis in "xyz"),
+        *(f"field.linear_acceleration_covariance{k}" for k in range(3)),
+    ]
+)
+INDEXED = (
+    "timestamp [ns],gyro_rad[0],gyro_rad[1],gyro_rad[2],gyro_integral_dt,"
+    "accelerometer_timestamp_relative,accelerometer_m_s2[0],accelerometer_m_s2[1],"
+    "accelerometer_m_s2[2],accelerometer_integral_dt,accelerometer_clipping"
+)
+COUNTED = (
+    "#counter,sec,nsec,angular_velocity_x,angular_velocity_y,angular_velocity_z,"
+    "linear_acceleration_x,linear_acceleration_y,linear_acceleration_z"
+)
+RATES = "Time_ns,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,T,GH,AH,GHz,AHz"
+FORMS: dict[str, tuple[str, Callable[[int, list[str]], list[str]]]] = {
+    "covariances, and a stamp behind the time of recording": (ECHOED, _echoed),
+    "axes by an index, and times of integration": (
+        INDEXED,
+        lambda t, v: [str(t), *v[:3], "5000", "0", *v[3:], "5000", "0"],
+    ),
+    "a counter before seconds and nanoseconds": (
+        COUNTED,
+        lambda t, v: ["9", str(t // 10**9), str(t % 10**9), *v],
+    ),
+    "health and rate of both sensors": (
+        RATES,
+        lambda t, v: [str(t), "0", *v, "45.1", "1", "1", "2000", "1000"],
+    ),
+    "axes in brackets": (
+        "t [ns],Gyro (z),Gyro (x),Gyro (y),Accel (z),Accel (x),Accel (y),temperature",
+        lambda t, v: [str(t), v[2], *v[:2], v[5], *v[3:5], "20"],
+    ),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_columns_of_a_logger_are_found_by_their_names(form: str, tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    expected = _samples(folder)
+    (folder / "imu.csv").write_text(_text(FORMS[form][0], expected, FORMS[form][1]))
+    found = _samples(folder)
+    assert [t for t, _ in found] == [t for t, _ in expected]
+    np.testing.assert_array_equal([v for _, v in found], [v for _, v in expected])
+    assert not any("doubtful" in note for note in open_dataset(folder).recording.notes)
+
+
+def test_one_imu_of_a_log_that_holds_several_is_read(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    expected = _samples(folder)
+    both = [(t, v + shift) for t, v in expected for shift in (0.0, 0.5)]
+    numbers = iter([0, 1] * len(expected))
+    cells = lambda t, v: [str(t), str(next(numbers)), *v]  # noqa: E731
+    (folder / "imu.csv").write_text(_text("Time_ns,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ", both, cells))
+    found = _samples(folder)
+    np.testing.assert_array_equal([v for _, v in found], [v for _, v in expected])
+    notes = open_dataset(folder).recording.notes
+    assert any("holds 2 IMUs; the readings of number 0 are used" in note for note in notes)
+
+
+def test_sensors_of_a_phone_may_state_two_times_and_another_order(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    expected = _samples(folder)
+    (folder / "imu.csv").unlink()
+    reversed_axes = {"Gyroscope": slice(2, None, -1), "TotalAcceleration": slice(5, 2, -1)}
+    start = expected[0][0]
+    for name, axes in reversed_axes.items():
+        cells = lambda t, v, axes=axes: [str(t), str((t - start) / 1e9), *v[axes]]  # noqa: E731
+        (folder / f"{name}.csv").write_text(_text("time,seconds_elapsed,z,y,x", expected, cells))
+    # without gravity
+    (folder / "Accelerometer.csv").write_text("time,seconds_elapsed,z,y,x\n1,0,0,0,0\n")
+    found = _samples(folder)
+    assert [t for t, _ in found] == [t for t, _ in expected]
+    np.testing.assert_allclose([v for _, v in found], [v for _, v in expected], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "header", "wanted"),
+    [
+        ("flight_sensor_combined_0.csv", INDEXED, "imu.csv"),
+        ("GX010001_GYRO.csv", "cts,date,gyro x,gyro y,gyro z", "gyro.csv"),
+        ("GX010001_ACCL.csv", "cts,date,accel x,accel y,accel z", "accel.csv"),
+        ("GX010001_GPS.csv", "cts,date,lat,lon,alt,speed,dop,fix", None),
+        ("gyro_scale.csv", "x,y,z", None),
+    ],
+)
+def test_tables_of_sensors_are_told_by_what_they_hold(
+    name: str, header: str, wanted: str | None, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_text(header + "\n" + ",".join("1" for _ in header.split(",")) + "\n")
+    assert names_readings(path) == wanted
