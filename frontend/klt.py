@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from vio.frontend.anchor_fit import AnchorFit
+from vio.frontend.columns import take
 from vio.frontend.flow import follow
 from vio.frontend.frame_images import FrameImages, ImagePreparation
 from vio.frontend.frames import Stopwatch, make_output, usable_prior
@@ -141,6 +142,11 @@ class KltFrontend:
         watch.lap("track")
         problem = self._problem(frame.index, INLIER_PX)
         seen, motion = self._static.select(problem, old, found, seen, prior, expected, images)
+        if self._static.slow is not None:
+            followed = ~self._static.slow
+            old = take(old, followed)
+            found = found[followed]
+            seen = seen[followed]
         watch.lap("reject")
         tracks = self._anchor_fit.track(old, previous.left, left, found, seen, motion)
         watch.lap("align")

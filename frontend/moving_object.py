@@ -407,6 +407,33 @@ def _without_slow_object(
     return None
 
 
+def without_young_object(
+    problem: RansacProblem,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    found: Consensus,
+    old: BoolArray,
+) -> TwoMotions | None:
+    """The motion of the points (N,) that were there before an object, and those that follow it as
+    well as they do; None: they are few, or all follow.
+
+    An object that has stopped moves by less than the limit of an outlier, and its points pass for
+    static ones.
+    """
+    static = old & found.inliers
+    if static.sum() < max(MIN_POINTS, _VOTE.clear_share * old.sum()):
+        return None
+    T, _ = best_motion(problem, p_prev[static], pixels[static], found.T_curr_prev[None])
+    errors = pixel_errors(problem.camera, T, p_prev, pixels)
+    usual_px = _VOTE.following_ratio * float(np.median(errors[static]))
+    kept = static | (errors <= min(usual_px, problem.limit_px))
+    moving = found.inliers & ~kept
+    if not moving.any():
+        return None
+    object_share = _if_large(share_of(moving))
+    return TwoMotions(Consensus(T, kept), object_share, "voted" if object_share else None)
+
+
 def _elected(first: BoolArray, second: BoolArray) -> Literal["first", "second"] | None:
     """Which of two motions most of the voting points follow, of those (N,) that only one of them
     explains.

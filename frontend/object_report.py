@@ -43,6 +43,7 @@ class ObjectReport(Finder):
         self._usual = deque[float](maxlen=_EVENT.clear_frames)
         self._frames = 0  # with an object, in a row
         self._since = 0  # the first of them
+        self._event_since = 0  # the first of the event that was reported
         self._decided = deque[int]()  # recent frames in which it was told from the scene
         self._clear = 0  # without one, in a row
         self._hidden = 0  # that an object hides, in a row
@@ -56,6 +57,11 @@ class ObjectReport(Finder):
         frames.
         """
         return self._active
+
+    @property
+    def since(self) -> int | None:
+        """The first frame of the event that goes on, or has just ended; None: there is none."""
+        return self._event_since if self._reported is not None else None
 
     def questioned(
         self,
@@ -159,6 +165,7 @@ class ObjectReport(Finder):
 
     def _report(self, index: int, motions: TwoMotions) -> None:
         share = round(100 * motions.object_share)
+        self._event_since = self._since
         self._reported = "object-covers-image"
         by = "the points seen before" if motions.decision == "voted" else "its predicted motion"
         message = (

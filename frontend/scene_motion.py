@@ -11,7 +11,13 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.findings import Finding
-from vio.frontend.moving_object import TwoMotions, choose_motion, one_motion_explains, voters
+from vio.frontend.moving_object import (
+    TwoMotions,
+    choose_motion,
+    one_motion_explains,
+    voters,
+    without_young_object,
+)
 from vio.frontend.object_report import ObjectReport
 from vio.frontend.outliers import Consensus, RansacProblem
 from vio.geometry.lie import FloatArray
@@ -37,6 +43,8 @@ class SceneChoice:
     motion: Consensus  # the camera's, over the points
     object_share: float  # share of the points that follow another motion; 0: no large group does
     hidden: bool  # an object has left too few points of the scene: none is to be used
+    # (N,) points of an object that moves too slowly to be lost: they are not followed further
+    slow: BoolArray | None = None
 
     @property
     def static(self) -> BoolArray:
@@ -99,9 +107,17 @@ class SceneMotion:
             chosen = self._report.questioned(
                 chosen, problem.camera, points.p_prev, expected, voting, disparity_error_px
             )
+        slow = None
+        event = self._report.since
+        if event is not None and chosen.object_share == 0.0:
+            old = points.age > index - event
+            young = without_young_object(problem, points.p_prev, points.pixels, chosen.motion, old)
+            if young is not None:
+                slow = chosen.motion.inliers & ~young.motion.inliers
+                chosen = young
         self._report.frame(index, chosen)
         hidden = self._report.hides_scene(index, chosen) and measured is None
-        return SceneChoice(chosen.motion, chosen.object_share, hidden)
+        return SceneChoice(chosen.motion, chosen.object_share, hidden, slow)
 
     def _is_one_motion(
         self,

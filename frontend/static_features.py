@@ -30,6 +30,8 @@ class StaticFeatures:
         """Prepare; `right` says whether depths need a right image."""
         self._right = right
         self._scene = SceneMotion()
+        # (N,) features of the last frame that are not to be followed further; None: all are
+        self.slow: BoolArray | None = None
 
     def take_findings(self) -> tuple[Finding, ...]:
         """Return what was found since the last call."""
@@ -59,6 +61,7 @@ class StaticFeatures:
         """
         camera = problem.camera
         stereo = images.stereo
+        self.slow = None
         rows = seen.nonzero()[0]
         has_depth = (old.has_point & (old.has_right | (not self._right.needed)))[rows]
         deep = has_depth.nonzero()[0]
@@ -86,6 +89,9 @@ class StaticFeatures:
                 return np.zeros(len(old), dtype=np.bool_), None
             motion = chosen.motion
             kept[has_depth] = motion.inliers
+            if chosen.slow is not None:
+                self.slow = np.zeros(len(old), dtype=np.bool_)
+                self.slow[rows[deep]] = chosen.slow
         if motion is not None and not has_depth.all():
             distance = epipolar_distance(
                 camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m

@@ -26,16 +26,25 @@ from vio.frontend.moving_object import (
     one_motion_explains,
     static_by_prediction,
     voters,
+    without_young_object,
 )
 from vio.frontend.object_report import ObjectReport
 from vio.frontend.outliers import Consensus, pixel_errors, rigid_consensus
 from vio.frontend.patches import ImageLevels
 from vio.frontend.right_images import RightImages
+from vio.frontend.scene_motion import MovedPoints, SceneMotion
 from vio.frontend.settings import DisparitySettings
 from vio.frontend.static_features import StaticFeatures
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import ANCHOR_RADIUS_PX, AnchorBank, new_tracks
-from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.geometry.lie import (
+    FloatArray,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+    so3_exp,
+)
 from vio.geometry.stereo import project, triangulate
 from vio.records import BoolArray, MotionPrior, StereoFrame, TrackPrior
 
@@ -392,6 +401,60 @@ def test_a_slow_object_that_some_frames_show_is_reported(every: int, named: bool
     found = report.take_findings()
     assert [f.code for f in found] == (["object-covers-image"] if named else [])
     assert [f.since for f in found] == ([0] if named else [])
+
+
+def _stopped(old: int, young: int, shift_px: float) -> tuple[FloatArray, FloatArray, Consensus]:
+    """Points (N, 3) of the scene and of an object that moves by some pixels beside it, their pixels
+    (N, 2), and the consensus, which all of them follow.
+    """
+    p = scene(old + young, 12, (8.0, 40.0))
+    turn = se3_exp([0.0, 0.0, 0.0, 0.0, shift_px / CAMERA.fu, 0.0])
+    uv = pixels(T_TRUE, p, 3, 0.05)
+    uv[old:] = pixels(turn @ T_TRUE, p[old:], 4, 0.05)
+    return p, uv, Consensus(T_TRUE, np.ones(len(p), dtype=np.bool_))
+
+
+@pytest.mark.parametrize(("shift_px", "object_share"), [(0.6, 0.75), (0.0, 0.0)])
+def test_an_object_that_has_nearly_stopped_is_told_by_the_points_older_than_it(
+    shift_px: float, object_share: float
+) -> None:
+    p, uv, found = _stopped(60, 180, shift_px)
+    old = np.arange(len(p)) < 60
+    chosen = without_young_object(make_problem(), p, uv, found, old)
+    kept = found.inliers if chosen is None else chosen.motion.inliers
+    assert kept[old].all()
+    assert kept[~old].mean() == pytest.approx(1.0 - object_share / 0.75, abs=0.05)
+    share = 0.0 if chosen is None else chosen.object_share
+    assert share == pytest.approx(object_share, abs=0.05)
+
+
+def test_an_object_that_has_nearly_stopped_is_left_as_it_is_where_few_older_points_are_left() -> (
+    None
+):
+    p, uv, found = _stopped(11, 180, 0.6)
+    assert without_young_object(make_problem(), p, uv, found, np.arange(len(p)) < 11) is None
+
+
+def test_points_of_an_object_that_walks_in_and_stops_are_not_followed_further() -> None:
+    p, moving, _ = scenery(120, 100)
+    age = np.where(np.arange(len(p)) < 120, 50, 0)
+    motion = SceneMotion()
+    p_stopped, stopped, everything = _stopped(120, 100, 0.6)
+    slow = []
+    for index in range(14):
+        points = MovedPoints(p, moving, age + index)
+        found = rigid_consensus(make_problem(), p, moving, T_TRUE, None, None)
+        if index >= 8:
+            points = MovedPoints(p_stopped, stopped, age + index)
+            found = everything
+        assert found is not None
+        slow.append(motion.choose(index, make_problem(), points, found, None, 0.0).slow)
+    assert [f.code for f in motion.take_findings()] == ["object-covers-image"]
+    assert slow[7] is None
+    for mask in slow[8:]:
+        assert mask is not None
+        assert mask[120:].mean() > 0.95
+        assert not mask[:120].any()
 
 
 def _lines(p: FloatArray, z: FloatArray, uv: FloatArray) -> list[str]:

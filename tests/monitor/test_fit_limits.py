@@ -13,8 +13,8 @@ from tests.guard.test_matches import CAMERA
 from tests.monitor.test_limits import _estimate
 from vio.geometry.lie import FloatArray
 from vio.monitor import frozen, gyro, gyro_fit, inertial, samples
-from vio.monitor.accelerometer import _wrong_axes, _wrong_scale, judge_force
-from vio.monitor.force_fit import Evidence, ForceFit, _windows, fit_force
+from vio.monitor.accelerometer import _opposite, _wrong_axes, _wrong_scale, judge_force
+from vio.monitor.force_fit import WINDOW_S, Evidence, ForceFit, _windows, fit_force
 from vio.monitor.frozen import FrozenImages
 from vio.monitor.gyro_fit import judge_offset, judge_stamps
 from vio.monitor.health import RefusalReport
@@ -33,7 +33,7 @@ I3 = np.eye(3)
 
 
 def _force(windows: int = 3, **costs: Any) -> Any:
-    return SimpleNamespace(windows=windows, **costs)
+    return SimpleNamespace(windows=windows, window_s=WINDOW_S, **costs)
 
 
 def _other_axes(ratio: float, windows: int) -> bool:
@@ -43,6 +43,15 @@ def _other_axes(ratio: float, windows: int) -> bool:
         return 1.0 if np.array_equal(np.abs(C), I3) else 1.0 / ratio
 
     return _wrong_axes(_force(windows, cost=cost), I3) is not None
+
+
+def _other_sign(ratio: float) -> bool:
+    """Whether the opposite sign is named that fits better than the given one by a ratio."""
+
+    def cost(C: FloatArray) -> float:
+        return 1.0 if C[0, 0] > 0.0 else 1.0 / ratio
+
+    return _opposite(_force(2, cost=cost, sign=lambda C: (-1.0, 0.1)), I3) is not None
 
 
 def _sign_is_known(sigmas: float) -> bool:
@@ -92,7 +101,7 @@ def _gyro_of(record: Record, **more: Any) -> Any:
 def _window_count(intervals: int) -> int:
     """Windows of so many intervals of an eighth of a second."""
     record = _record(intervals)
-    return len(list(_windows(record, _gyro_of(record))))
+    return len(list(_windows(record, _gyro_of(record), WINDOW_S)))
 
 
 def _is_fitted(windows: int) -> bool:
@@ -136,6 +145,7 @@ def _unexplained(column: int, sigma: float) -> float:
 FORCE: dict[str, tuple[Says, float, float]] = {
     "axes": (lambda x: _other_axes(x, 3), 2.6, 3.4),
     "axes: early": (lambda x: _other_axes(x, 2), 7.8, 10.2),
+    "sign: early": (_other_sign, 7.8, 10.2),
     "sign": (_sign_is_known, 5.3, 6.7),
     "scale": (_scaled, 2.6, 3.4),
     "scale: explained": (lambda x: _scaled(explained=x), 3.5, 4.5),

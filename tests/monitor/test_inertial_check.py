@@ -329,6 +329,29 @@ def test_names_an_inverted_axis_of_the_accelerometer_when_the_run_ends_after_fou
     ]
 
 
+@pytest.mark.parametrize(
+    ("name", "fault", "begin", "end"),
+    [
+        ("inverted accelerometer", "sign", 0, 90),
+        ("inverted accelerometer", "sign", 0, 52),
+        ("cycled accelerometer", "axes", 0, 90),
+        ("cycled accelerometer", "axes", 120, 172),
+        ("", "", 0, 90),
+        ("", "", 0, 52),
+    ],
+)
+def test_other_signs_or_axes_of_the_accelerometer_are_named_in_a_short_run(
+    name: str, fault: str, begin: int, end: int
+) -> None:
+    it = _recording("room", 2)
+    samples = _CORRUPTED[name][0](it) if name else it.samples
+    seen = it.frames[begin:end]
+    begin_ns = seen[0].time_ns - _FRAME_NS
+    samples = [s for s in samples if begin_ns < s.time_ns < seen[-1].time_ns + _FRAME_NS]
+    found = _watch(it, samples=samples, frames=seen)
+    assert _faults(found) == ([f"accelerometer {fault}"] if fault else [])
+
+
 @pytest.mark.parametrize(("name", "said"), [("", True), ("cycled accelerometer", False)])
 def test_a_run_blames_the_baseline_only_once_the_accelerometers_axes_are_right(
     name: str, said: bool

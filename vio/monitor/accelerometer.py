@@ -32,7 +32,8 @@ class _AxesRules(NamedTuple):
     """When axes or signs of the accelerometer are others."""
 
     sign_sigmas: float = 6.0
-    # likewise in fewer windows; right axes came to at most 1.2 in 178 pieces of flights and drives
+    # likewise of axes, and of the opposite sign, in fewer or shorter windows; right axes came to at
+    # most 1.2 in 178 pieces of flights and drives
     worse_early: float = 9.0
     upside_down_cosine: float = 0.5  # cosine between image-down and up: within 60 degrees
     upside_down_share: float = 0.95
@@ -103,9 +104,11 @@ def judge_force(
     readings = gyro_fit.force[gyro_fit.covered]
     if evidence.early_force is not None:
         wrong = _wrong_axes(evidence.early_force, R * unit)
+        if wrong is None and force is None:
+            wrong = _opposite(evidence.early_force, R * unit)
         if wrong is not None:
             return [wrong], True
-        if camera is not None:
+        if camera is not None and evidence.early_force.window_s == WINDOW_S:
             scaled = _wrong_scale(evidence.early_force, R * unit, camera)
             if scaled is not None:
                 return [scaled], True
@@ -126,6 +129,13 @@ def _wrong_sign(scale: float, sigma: float) -> InertialFinding:
         "all readings have the wrong sign (specific force is +9.8 m/s^2 upwards at standstill); "
         "change it",
     )
+
+
+def _opposite(force: ForceFit, C: FloatArray) -> InertialFinding | None:
+    """Return that the negative of a map (3, 3) fits so much better that two windows suffice."""
+    if force.cost(-C) * _AXES.worse_early > force.cost(C):
+        return None
+    return _wrong_sign(*force.sign(C))
 
 
 def _wrong_scale(force: ForceFit, C: FloatArray, camera: StereoCamera) -> InertialFinding | None:
@@ -175,7 +185,7 @@ def _wrong_axes(force: ForceFit, C: FloatArray) -> InertialFinding | None:
         "accelerometer axes",
         "with the given axes the accelerometer deviates from the camera's path by "
         f"{100 * np.sqrt(given):.1f} cm over "
-        f"{WINDOW_S:g} s, with others by {100 * np.sqrt(costs[k]):.1f} cm, while the gyro agrees",
+        f"{force.window_s:g} s, with others by {100 * np.sqrt(costs[k]):.1f} cm, while the gyro agrees",
         f"its axes contain {axes_text(others[k].T)} in place of [+x +y +z]; correct their order "
         "and signs",
     )

@@ -19,7 +19,9 @@ from vio.numerics.robust import jackknife
 from vio.records import BoolArray
 
 WINDOW_S = 2.0
-MIN_WINDOWS = 3  # for all but axes that are clearly wrong
+# of records with fewer than two of the others: enough for axes and signs that are clearly wrong
+SHORT_WINDOW_S = 1.0
+MIN_WINDOWS = 3  # for all but axes and signs that are clearly wrong
 
 
 class _FitPriors(NamedTuple):
@@ -49,6 +51,7 @@ class ForceFit:
     h: FloatArray  # (W, 15)
     c: FloatArray  # (W,)
     weight: FloatArray  # (W,)
+    window_s: float = WINDOW_S  # length of each
 
     @property
     def windows(self) -> int:
@@ -97,7 +100,7 @@ class Evidence:
     gyro_fit: GyroFit
     # None: too few windows without tracking loss, or the readings have no unit
     force: ForceFit | None
-    # likewise, from fewer windows: enough for axes that are clearly wrong
+    # likewise, from fewer or shorter windows: enough for axes and signs that are clearly wrong
     early_force: ForceFit | None
     force_final: bool  # `force` will not improve: what it leaves undecided is judged without it
     # readings at the end of the range were found, which make rotations appear smaller
@@ -127,13 +130,16 @@ class _Window:
     force: FloatArray  # (n, 3) mean readings of the accelerometer
 
 
-def fit_force(record: Record, gyro_fit: GyroFit, lever_arm: FloatArray) -> ForceFit | None:
-    """Fit over whole windows; None: too few of them are without tracking loss.
+def fit_force(
+    record: Record, gyro_fit: GyroFit, lever_arm: FloatArray, window_s: float = WINDOW_S
+) -> ForceFit | None:
+    """Fit over whole windows of a length; None: too few of them are without tracking loss.
 
     The gyro's fit gives the camera's rotation where it explains the images. A correction to the
     given position of the IMU in cam0, `lever_arm` (3,) in metres, is fitted, too.
     """
-    blocks = [_normal_equations(window, lever_arm) for window in _windows(record, gyro_fit)]
+    windows = _windows(record, gyro_fit, window_s)
+    blocks = [_normal_equations(window, lever_arm) for window in windows]
     if len(blocks) < _PRIORS.min_windows:
         return None
     N, h, c = (np.array([b[k] for b in blocks]) for k in range(3))
@@ -143,10 +149,10 @@ def fit_force(record: Record, gyro_fit: GyroFit, lever_arm: FloatArray) -> Force
         x = np.linalg.solve(np.tensordot(weight, N, 1) + prior, weight @ h)
         misfit = np.maximum(c - 2 * h @ x + np.einsum("i,wij,j->w", x, N, x), 0)
         weight = 1 / (1 + misfit / max(4 * float(np.median(misfit)), 1e-9)) ** 2
-    return ForceFit(N, h, c, weight)
+    return ForceFit(N, h, c, weight, window_s)
 
 
-def _windows(record: Record, gyro_fit: GyroFit) -> Iterator[_Window]:
+def _windows(record: Record, gyro_fit: GyroFit, window_s: float) -> Iterator[_Window]:
     """Yield consecutive windows; after a tracking loss the next one starts anew."""
     dt = record.end - record.begin
     joined = record.joined
@@ -160,7 +166,7 @@ def _windows(record: Record, gyro_fit: GyroFit) -> Iterator[_Window]:
         last = first
         while last < len(dt) and gyro_fit.covered[last] and (last == first or joined[last]):
             last += 1
-            if record.end[last - 1] - record.begin[first] >= WINDOW_S:
+            if record.end[last - 1] - record.begin[first] >= window_s:
                 rows = slice(first, last)
                 yield _Window(dt[rows], omega[rows], record.twists[rows], gyro_fit.force[rows])
                 break

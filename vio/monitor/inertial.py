@@ -19,7 +19,14 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.imu.clocks import SampleCoverage
 from vio.imu.findings import InertialFault, InertialFinding
-from vio.monitor.force_fit import MIN_WINDOWS, Evidence, fit_force
+from vio.monitor.force_fit import (
+    MIN_WINDOWS,
+    SHORT_WINDOW_S,
+    WINDOW_S,
+    Evidence,
+    ForceFit,
+    fit_force,
+)
 from vio.monitor.gyro_fit import (
     FIRST_EVALUATION,
     GyroFit,
@@ -226,15 +233,14 @@ class InertialCheck:
 
     def _evidence(self, size: Size, record: Record, gyro_fit: GyroFit, *, last: bool) -> Evidence:
         """Return what both sensors show beside the images."""
-        if size.unit is None:
-            early = None
-        else:
-            early = fit_force(record, gyro_fit, self._T[:3, 3])
-        if early is None or early.windows < MIN_WINDOWS:
-            force = None
-        else:
-            force = early
-        self.axes_compared |= early is not None
+        force: ForceFit | None = None
+        early: ForceFit | None = None
+        if size.unit is not None:
+            early = self._fit_force(record, gyro_fit)
+        if early is not None and early.window_s == WINDOW_S:
+            self.axes_compared = True
+            if early.windows >= MIN_WINDOWS:
+                force = early
         return Evidence(
             R_cam0_imu=self._T[:3, :3],
             gyro_fit=gyro_fit,
@@ -249,6 +255,16 @@ class InertialCheck:
             last=last,
             turn=self._turn(gyro_fit),
         )
+
+    def _fit_force(self, record: Record, gyro_fit: GyroFit) -> ForceFit | None:
+        """The accelerometer beside the images, over shorter windows where there are no two of the
+        usual length, and the gyro shows that the given rotation is right.
+        """
+        lever_arm = self._T[:3, 3]
+        long = fit_force(record, gyro_fit, lever_arm)
+        if long is not None or not gyro_fit.fits(self._T[:3, :3]):
+            return long
+        return fit_force(record, gyro_fit, lever_arm, SHORT_WINDOW_S)
 
     @property
     def _is_clipped(self) -> bool:
