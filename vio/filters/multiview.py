@@ -125,7 +125,7 @@ def first_points(
         return p, known
     earlier = views.weight.copy()
     earlier[:, -1] = 0.0
-    left_only: BoolArray = ~known & (np.sum(earlier[..., 0] > 0, axis=1) >= 2)
+    left_only: BoolArray = ~known & ((earlier[..., 0] > 0).sum(axis=1) >= 2)
     if left_only.any():
         left = Views(views.z[left_only], earlier[left_only])
         start: FloatArray = np.empty((len(left.z), 3))
