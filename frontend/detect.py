@@ -193,7 +193,8 @@ def local_maxima(
     excluded.
     """
     height, width = response.shape
-    taken = np.clip(np.rint(occupied).astype(np.int64), 0, [width - 1, height - 1])
+    taken = np.rint(occupied).astype(np.int64)
+    np.maximum(np.minimum(taken, [width - 1, height - 1]), 0, out=taken)
     free = response.copy()
     found = np.empty((response.size, 2), dtype=np.int64)
     count = _find_maxima(free, taken, distance, border, np.float32(max(least, 1e-12)), found)

@@ -246,6 +246,6 @@ def lucas_kanade(
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=_FLOW.lk_min_eigenvalue,
     )
-    pixels = np.asarray(found, dtype=np.float64).reshape(-1, 2)
-    is_found = np.asarray(status).reshape(-1) == 1
+    pixels = found[:, 0].astype(np.float64)
+    is_found = status[:, 0] == 1
     return pixels, is_found & np.isfinite(pixels).all(axis=1)

@@ -40,7 +40,9 @@ class Stopwatch:
     def lap(self, stage: str) -> None:
         """Add the time since the last lap to a stage."""
         now = time.perf_counter()
-        self.stages_ms[stage] = self.stages_ms.get(stage, 0.0) + 1e3 * (now - self._last)
+        if stage not in self.stages_ms:
+            self.stages_ms[stage] = 0.0
+        self.stages_ms[stage] += 1e3 * (now - self._last)
         self._last = now
 
 

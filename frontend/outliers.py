@@ -76,6 +76,7 @@ class _ConsensusRules(NamedTuple):
 
 
 _CONSENSUS = _ConsensusRules()
+_STILL = np.eye(4)  # no motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,12 +105,13 @@ def pixel_errors(
 
     Points behind the camera have infinite distance.
     """
-    T = np.ascontiguousarray(T_curr_prev).reshape(-1, 4, 4)
-    out = np.empty((len(T), len(p_prev)))
+    T = np.ascontiguousarray(T_curr_prev)
+    motions = T[None] if T.ndim == 2 else T.reshape(-1, 4, 4)
     points = np.ascontiguousarray(p_prev)
     seen = np.ascontiguousarray(pixels)
-    _distances(camera_args(camera), T, points, seen, out)
-    return out.reshape(*T_curr_prev.shape[:-2], len(p_prev))
+    out = np.empty((len(motions), len(points)))
+    _distances(camera_args(camera), motions, points, seen, out)
+    return out[0] if T.ndim == 2 else out.reshape(*T.shape[:-2], len(points))
 
 
 @compiled
@@ -470,16 +472,17 @@ def rigid_consensus(
     """
     if len(p_prev) < _RANSAC.min_points:
         return None
-    starts = [expected, np.eye(4)]
+    starts = [expected, _STILL]
     if R_prior is not None:
         starts.append(se3_from_parts(R_prior, expected[:3, 3]))
     if T_prior is not None:
         starts.append(T_prior)
-    T, inliers = _ransac(problem, p_prev, pixels, np.stack(starts), slice(0, 6))
+    T, inliers = _ransac(problem, p_prev, pixels, np.array(starts), slice(0, 6))
     # Only outliers of the consensus support another motion: a prior that agrees with the consensus
     # is not tried.
-    needed = max(_RANSAC.min_points, _RANSAC.prior_min_support_share * inliers.sum())
-    if (~inliers).sum() >= needed:
+    count = int(inliers.sum())
+    needed = max(_RANSAC.min_points, _RANSAC.prior_min_support_share * count)
+    if len(inliers) - count >= needed:
         for T_near in _prior_candidates(problem, p_prev, pixels, T, expected, R_prior, T_prior):
             kept = pixel_errors(problem.camera, T_near, p_prev, pixels) <= problem.limit_px
             if (kept & ~inliers).sum() >= needed:
@@ -492,8 +495,9 @@ def rigid_consensus(
                     slice(0, 6),
                 )
                 inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
+                count = int(inliers.sum())
                 break
-    if inliers.sum() < max(_RANSAC.min_points, _RANSAC.min_share * len(inliers)):
+    if count < max(_RANSAC.min_points, _RANSAC.min_share * len(inliers)):
         return None
     return Consensus(T, inliers)
 

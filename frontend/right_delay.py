@@ -58,6 +58,7 @@ class _OtherPairing(NamedTuple):
 
 _OTHER = _OtherPairing()
 _TERMS = 6
+_PRIOR: FloatArray = 1e-6 * np.eye(_TERMS + 1)  # keeps the fit solvable
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +132,7 @@ class RightDelay(Finder):
         self._count = _DELAY.memory * self._count + count
         self._frames += 1
         self._solution = self._moment.copy()
-        solve_positive(self._normal + 1e-6 * np.eye(_TERMS + 1), self._solution)
+        solve_positive(self._normal + _PRIOR, self._solution)
         before = self.frames == 0.0, self._early
         self._decide(index, frame_s)
         return before != (self.frames == 0.0, self._early)
@@ -223,7 +224,7 @@ class RightDelay(Finder):
         """The delay in frames, its standard deviation, and the share of the rows' scatter that
         it explains.
         """
-        A = self._normal + 1e-6 * np.eye(_TERMS + 1)
+        A = self._normal + _PRIOR
         b = self._moment
         constant = np.linalg.solve(
             A[:_TERMS, :_TERMS], np.column_stack([A[:_TERMS, _TERMS], b[:_TERMS]])

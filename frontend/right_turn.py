@@ -12,6 +12,7 @@ says how much less the disparities of a frame are known than those of as many fe
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import NamedTuple
 
@@ -198,5 +199,5 @@ class PairShake(Finder):
         if len(self._common_px) < _SHAKE.min_frames:
             return 0.0
         changes = np.diff(self._common_px)  # e - 2 e' + e'': six variances
-        sigmas = np.array([robust_sigma(self._common_px), robust_sigma(changes)])
-        return float((sigmas / np.sqrt([2.0, 6.0])).min())
+        of_frames = robust_sigma(self._common_px) / math.sqrt(2.0)
+        return min(of_frames, robust_sigma(changes) / math.sqrt(6.0))

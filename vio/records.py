@@ -49,6 +49,7 @@ _ROTATION = _RotationRules()
 _KNOWN: Tolerance[float] = 1e-8  # a standard deviation below it is rounding
 _INT64 = np.dtype(np.int64)
 _FLOAT64 = np.dtype(np.float64)
+_FLOAT32 = np.dtype(np.float32)
 _BOOL = np.dtype(np.bool_)
 
 
@@ -183,6 +184,30 @@ class Observations:
         """Raise DataError unless types and lengths are those above; the filters check the
         values.
         """
+        if not self._has_usual_types():
+            self._check()
+
+    def _has_usual_types(self) -> bool:
+        """Whether the types are exactly those above, as of nearly all: they are asked often."""
+        ids = self.ids
+        z = self.z
+        sigma = self.sigma
+        for value in (ids, z, self.has_right, self.stale):
+            if type(value) is not np.ndarray:
+                return False
+        if ids.ndim != 1 or type(self.time_ns) is not int:
+            return False
+        if sigma is not None and (sigma.dtype is not _FLOAT32 or sigma.shape != (*ids.shape, 3)):
+            return False
+        return (
+            ids.dtype is _INT64
+            and z.dtype is _FLOAT64
+            and self.has_right.dtype is self.stale.dtype is _BOOL
+            and z.shape == (*ids.shape, 4)
+            and self.has_right.shape == self.stale.shape == ids.shape
+        )
+
+    def _check(self) -> None:
         shape = getattr(self.ids, "shape", None)
         for name, value, dtype, expected in (
             ("ids", self.ids, _INT64, shape if shape is not None and len(shape) == 1 else ("N",)),

@@ -13,11 +13,11 @@ from tests.replaced_rules import replaced
 from vio.filters.multiview import (
     CAUCHY,
     first_points,
+    linearised_points,
     refine_points,
     residuals,
     robust_weights,
     track_information,
-    usable_points,
 )
 from vio.filters.stereo_calibration import eliminate_points
 from vio.filters.track_records import Residuals, Views
@@ -247,7 +247,8 @@ def test_left_views_need_the_parallax_of_a_baseline_and_stereo_views_none(
     for left_only in (True, False):
         T, p, at = _sideways(spread_m, 5.0, left_only)
         views = Views(np.zeros_like(at.r), np.ones_like(at.r))
-        found = usable_points(CAMERA, T, p, _left_only(views) if left_only else views, at)
+        seen = _left_only(views) if left_only else views
+        found = linearised_points(CAMERA, T, p, seen, 0, 1.0)[2]
         assert np.all(found == (enough or not left_only))
 
 

@@ -251,7 +251,7 @@ def test_jacobian_of_the_cloned_camera_equals_central_differences() -> None:
         column = online_calibration.BLOCKS[name].camera_D_error(
             calibration, window.nav.T_world_imu, exposed, twist
         )
-        np.testing.assert_allclose(column, numeric[:, window.state[name]], atol=1e-6)
+        np.testing.assert_allclose(column, numeric[:, window.state.blocks[name]], atol=1e-6)
 
 
 def test_moving_the_means_moves_cameras_and_bodies_as_their_errors_say() -> None:
@@ -280,7 +280,7 @@ def test_the_extrinsics_error_moves_with_the_body() -> None:
     window, delta = _window(clones=0), np.array([0.01, -0.02, 0.03, 0.01, 0.02, -0.01])
     R, p, *_ = Shaking().state(0.9)
     nav = NavState(se3_from_parts(R, p), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    rows = np.r_[window.state["extrinsics"]]
+    rows = np.r_[window.state.blocks["extrinsics"]]
     P = np.zeros_like(window.prior.P)
     before = se3_adjoint(window.nav.T_world_imu) @ delta
     P[np.ix_(rows, rows)], window.prior.delta[rows] = np.outer(before, before), before

@@ -19,7 +19,7 @@ from vio.filters.imu_jump import Contradiction, GyroJump, ShownMotion
 from vio.filters.landmark_gate import LandmarkGate
 from vio.filters.mono_start import MonoStarter, _disagreement, is_still
 from vio.filters.msckf import _check_sane
-from vio.filters.multiview import residuals, usable_points
+from vio.filters.multiview import linearised_points
 from vio.filters.navigation import Growth, ImuMotion, NavState
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.settings import MsckfSettings, VislamSettings
@@ -424,7 +424,7 @@ def _depth_known(parallax_px: float, camera: StereoCamera) -> bool:
     weight = np.zeros(z.shape)
     weight[..., :2] = 1.0
     views = Views(z, weight)
-    return bool(usable_points(camera, T, p, views, residuals(camera, T, p, views))[0])
+    return bool(linearised_points(camera, T, p, views, 0, 1.0)[2][0])
 
 
 def _too_fast(speed_mps: float) -> bool:

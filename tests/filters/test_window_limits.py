@@ -93,11 +93,8 @@ def _rows_have_moved(px: float) -> bool:
     """Whether columns are in doubt again where all rows move by so much after a hundred frames."""
     inflated: list[object] = []
 
-    class State(dict[str, slice]):
-        """Holds the field."""
-
     window: Any = SimpleNamespace(
-        state=State(stereo_field=slice(0, 8)),
+        state=SimpleNamespace(blocks={"stereo_field": slice(0, 8)}),
         prior=SimpleNamespace(inflate=lambda *arguments: inflated.append(arguments)),
         calibration=None,
     )

@@ -344,7 +344,10 @@ def test_points_are_refined_chosen_and_weighed_as_in_numpy(camera: StereoCamera)
     ours[20] = np.nan
     for lens in (camera, replace(camera, kind="mono")):
         at = multiview.residuals(lens, T, ours, views)
-        keep = multiview.usable_points(lens, T, ours, views, at)
+        moved, there, _ = multiview.linearised_points(lens, T, start, views, 3, 1.0)
+        np.testing.assert_array_equal(moved, multiview.refine_points(lens, T, start, views, 3, 1.0))
+        _same(there, multiview.residuals(lens, T, moved, views))
+        keep = multiview.linearised_points(lens, T, ours, views, 0, 1.0)[2]
         assert keep.tolist() == numpy_twins.usable_points(lens, T, ours, views, at).tolist()
         assert 0 < keep.sum() < len(keep)
     at = at.take(keep)

@@ -16,24 +16,23 @@ CameraArgs: TypeAlias = tuple[float, float, float, float, float, bool]
 
 
 _MAX_KNOWN: Capacity[int] = 8
-# by identity: a camera's hash costs more than the answer
-_known: dict[int, tuple[StereoCamera, CameraArgs]] = {}
+# the last ones, newest first; by identity, as a camera's hash costs more than the answer
+_known: list[tuple[StereoCamera, CameraArgs]] = []
 
 
 def camera_args(camera: StereoCamera) -> CameraArgs:
     """Return the intrinsics of both rectified images, as compiled functions take them."""
-    try:
-        return _known[id(camera)][1]
-    except KeyError:
-        fu = float(camera.fu)
-        fv = float(camera.fv)
-        cu = float(camera.cu)
-        cv = float(camera.cv)
-        if len(_known) == _MAX_KNOWN:
-            _known.clear()
-        args = fu, fv, cu, cv, float(camera.baseline_m), camera.is_cylinder
-        _known[id(camera)] = camera, args
-        return args
+    for known, args in _known:
+        if known is camera:
+            return args
+    fu = float(camera.fu)
+    fv = float(camera.fv)
+    cu = float(camera.cu)
+    cv = float(camera.cv)
+    args = fu, fv, cu, cv, float(camera.baseline_m), camera.is_cylinder
+    _known.insert(0, (camera, args))
+    del _known[_MAX_KNOWN:]
+    return args
 
 
 @compiled

@@ -38,13 +38,15 @@ class ErrorState:
             clones: how many.
             landmarks: how many.
         """
-        self._rows = {"nav": slice(0, DIM)}
+        # rows of the blocks of navigation state and calibration that are estimated, by name
+        self.blocks = {"nav": slice(0, DIM)}
         first = DIM
         for name, size in calibration.items():
-            self._rows[name] = slice(first, first + size)
+            self.blocks[name] = slice(first, first + size)
             first += size
-        self.nav = self._rows["nav"]
+        self.nav = self.blocks["nav"]
         self.own = slice(0, first)  # navigation state and calibration
+        self.own_identity = np.eye(first)
         self.calibration = slice(DIM, first)
         of_motion, of_pixels = (
             sum(size for name, size in calibration.items() if BLOCKS[name].enters == where)
@@ -58,17 +60,6 @@ class ErrorState:
         self.clones = slice(first, first + 6 * clones)
         self.landmarks = slice(self.clones.stop, self.clones.stop + 3 * landmarks)
         self.size = self.landmarks.stop
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._rows
-
-    def __getitem__(self, name: str) -> slice:
-        """Rows of a block of navigation state or calibration.
-
-        Raises:
-            KeyError: it is not estimated.
-        """
-        return self._rows[name]
 
     def clone(self, index: int) -> slice:
         """Rows of a clone, -1 being the newest."""

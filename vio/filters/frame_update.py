@@ -311,7 +311,7 @@ class FrameUpdate:
         size = window.state.clones.stop
         # without landmarks
         P = self.fit.move_to_optimum(window, tracks, columns, A, b, size).covariance()
-        fitted = float(np.sum(A[:size, :size] * P))
+        fitted = float((A[:size, :size] * P).sum())
         V = window.prior.error_D_constants[:size, 1:]
         if considered is not None:
             V = V - P @ (A[:size, :size] @ V + considered[:size])

@@ -150,7 +150,8 @@ class InputOrder:
                 f"{where} at {now} ns is before the last velocity ({reached_ns} ns); give both in "
                 "order of time"
             )
-        ids = np.sort(seen.ids)
+        ids = seen.ids.copy()
+        ids.sort()
         if (ids[1:] == ids[:-1]).any():
             doubled = int(ids[1:][ids[1:] == ids[:-1]][0])
             raise DataError(f"{where} observes feature {doubled} twice; an id names one feature")

@@ -214,7 +214,7 @@ class Msckf(Backend):
         now = (window.nav, propagation.since_frame)
         late_s = propagation.late_s
         exposure, expected = propagation.exposure(window, *now, late_s)
-        if "time_offset" in window.state and not window.clocks_compared:
+        if "time_offset" in window.state.blocks and not window.clocks_compared:
             exposure = self._compare_clocks(window, observations.time_ns, exposure)
         window.add_clone(observations.frame_index, observations.time_ns, exposure)
         self._keep_first_attitude(window)
@@ -248,9 +248,9 @@ class Msckf(Backend):
             propagation.noise = self._first_noise(P)
         window = self._window = self._first_window(nav, P, self._calibration)
         state = window.state
-        if "imu_terms" in state and isinstance(propagation.motion, ImuMotion):
+        if "imu_terms" in state.blocks and isinstance(propagation.motion, ImuMotion):
             to_tilt = np.eye(state.size)
-            to_tilt[3:6, state["imu_terms"]] = propagation.motion.tilt_D_terms(nav)  # (A4)
+            to_tilt[3:6, state.blocks["imu_terms"]] = propagation.motion.tilt_D_terms(nav)  # (A4)
             window.prior.transform(to_tilt)
         self._began_ns = observations.time_ns  # one camera begins anew after a divergence
         self._tilted = np.eye(3)
@@ -371,7 +371,7 @@ class Msckf(Backend):
         # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error
         # is its negative.
         A = se3_adjoint(se3_inverse(T))
-        M = np.eye(DIM, len(own))
+        M = window.state.own_identity[:DIM].copy()
         M[:6] = window.since_first(M[:6])
         known = motion.uncertainty(window.nav, M @ own @ M.T)
         R = window.calibration.R_upright_world.T
@@ -393,9 +393,9 @@ class Msckf(Backend):
         """Return the covariance (15, 15) of the errors of `Estimate.imu_terms`; zero where a
         term is not estimated.
         """
-        if self._window is None or "imu_terms" not in self._window.state:
+        if self._window is None or "imu_terms" not in self._window.state.blocks:
             return np.zeros((IMU_TERMS, IMU_TERMS))
-        own = self._window.state["imu_terms"]
+        own = self._window.state.blocks["imu_terms"]
         return all_imu_terms(self._propagation.own_covariance(self._window)[own, own])
 
     @property
@@ -470,7 +470,7 @@ class Msckf(Backend):
             len(window.clones) > self._settings.clones
             and window.clones[0].time_ns == self._began_ns
         )
-        if self._source == "imu" and leaving and "first_attitude" not in window.state:
+        if self._source == "imu" and leaving and "first_attitude" not in window.state.blocks:
             window.keep_first_attitude(
                 window.calibration.estimating("first_attitude", self._settings)
             )
@@ -538,7 +538,7 @@ def _vertical(window: Window, own: FloatArray, imu: ImuSettings) -> dict[str, An
 
 def _gravity(window: Window, imu: ImuSettings) -> FloatArray | None:
     """Gravity (3,) in the world that is reported, m/s^2; None: along -z."""
-    if "first_attitude" not in window.state:
+    if "first_attitude" not in window.state.blocks:
         return None
     out: FloatArray = window.calibration.R_upright_world.T @ [0.0, 0.0, -imu.gravity_mps2]
     return out

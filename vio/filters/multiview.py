@@ -72,7 +72,7 @@ def residuals(
         p_world: (F, 3).
         views: what was seen.
     """
-    at = _room(views.weight)
+    at = _room(views)
     loops.compare_views(_cameras(camera, T_cam0_world), p_world, views, at)
     return at
 
@@ -81,20 +81,17 @@ def _cameras(camera: StereoCamera, T_cam0_world: FloatArray) -> Cameras:
     return Cameras(camera_args(camera), MIN_DEPTH * camera.baseline_m, T_cam0_world)
 
 
-def _room(weight: FloatArray) -> Residuals:
-    """Room for the residuals of views (F, N) of given weights."""
-    F, N = weight.shape[:2]
-    return Residuals(
-        np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, dtype=np.bool_), weight
-    )
+def _room(views: Views) -> Residuals:
+    """Room for the residuals of views."""
+    F, N = views.weight.shape[:2]
+    ahead: BoolArray = np.empty(F, dtype=np.bool_)
+    return Residuals(np.empty((F, N, 4)), np.empty((F, N, 4, 3)), ahead, views.weight)
 
 
 def unweighted(z: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:
-    """Pixels (..., 4) that are expected where z was seen, of residuals times weights."""
+    """Pixels (F, N, 4) that are expected where z was seen, of residuals times weights."""
     out: FloatArray = np.empty(z.shape)
-    loops.expected_pixels(
-        z.reshape(-1, 4), r.reshape(-1, 4), weight.reshape(-1, 4), out.reshape(-1, 4)
-    )
+    loops.expected_pixels(z, r, weight, out)
     return out
 
 
@@ -128,7 +125,7 @@ def first_points(
         return p, known
     earlier = views.weight.copy()
     earlier[:, -1] = 0.0
-    left_only: BoolArray = ~known & (np.sum(earlier[..., 0] > 0, axis=1) >= 2)
+    left_only: BoolArray = ~known & ((earlier[..., 0] > 0).sum(axis=1) >= 2)
     if left_only.any():
         left = Views(views.z[left_only], earlier[left_only])
         start: FloatArray = np.empty((len(left.z), 3))
@@ -162,14 +159,38 @@ def refine_points(
     that saw the point.
     """
     p = p_world.copy()
-    damping = Damping(
-        scale_px**2, _TRIANGULATION.tiny, _TRIANGULATION.disparity_information, MIN_DISPARITY_PX
-    )
-    room = InverseDepth.empty(len(p))
-    loops.refine(
-        _cameras(camera, T_cam0_world), views, steps, damping, _room(views.weight), room, p
-    )
+    loops.refine(_cameras(camera, T_cam0_world), views, steps, _damping(scale_px), p)
     return p
+
+
+def _damping(scale_px: float) -> Damping:
+    """How steps on points are held back, with Cauchy weights of a scale in pixels."""
+    information = _TRIANGULATION.disparity_information
+    return Damping(scale_px**2, _TRIANGULATION.tiny, information, MIN_DISPARITY_PX)
+
+
+def linearised_points(
+    camera: StereoCamera,
+    T_cam0_world: FloatArray,
+    p_world: FloatArray,
+    views: Views,
+    steps: int,
+    scale_px: float,
+) -> tuple[FloatArray, Residuals, BoolArray]:
+    """Move points (F, 3) as `refine_points` does; return them, their `residuals` there, and which
+    of them (F,) are finite, ahead of all cameras that saw them, and have a depth by stereo or
+    parallax.
+
+    That is a right view, or a parallax that fixes the depth as well as one stereo view would. With
+    less, the estimated depth follows the noise, and its Jacobian by the clones' translations with
+    it: information that is not there, and a scale that shrinks. Of one camera, whose unit of length
+    is arbitrary, the depth must be known relative to itself.
+    """
+    keep: BoolArray = np.empty(len(p_world), dtype=np.bool_)
+    out = p_world.copy(), _room(views), keep
+    cameras = _cameras(camera, T_cam0_world)
+    loops.linearise(cameras, views, steps, _damping(scale_px), _depth_limits(camera), out)
+    return out
 
 
 def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
@@ -308,25 +329,11 @@ def relative_stereo_sigma(at: Residuals, q: InverseDepth, chosen: IntArray) -> F
     return out
 
 
-def usable_points(
-    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, at: Residuals
-) -> BoolArray:
-    """Which tracks (F,) have a finite point ahead of all cameras that saw it, and its depth by
-    stereo or parallax.
-
-    That is a right view, or a parallax that fixes the depth as well as one stereo view would. With
-    less, the estimated depth follows the noise, and its Jacobian by the clones' translations with
-    it: information that is not there, and a scale that shrinks. Of one camera, whose unit of length
-    is arbitrary, the depth must be known relative to itself.
-    """
-    keep: BoolArray = np.empty(len(p_world), dtype=np.bool_)
+def _depth_limits(camera: StereoCamera) -> DepthLimits:
+    """When parallax fixes a depth of a camera's points."""
     variances = (
         (0.0, _TRIANGULATION.mono_depth_sigma**2)
         if camera.kind == "mono"
         else (_TRIANGULATION.stereo_variance_px2, 0.0)
     )
-    limits = DepthLimits(*variances, _TRIANGULATION.tiny, _TRIANGULATION.disparity_information)
-    room = InverseDepth.empty(1)
-    seen = Residuals(at.r, at.z_D_p, at.ahead, views.weight)
-    loops.mark_usable(_cameras(camera, T_cam0_world), p_world, seen, limits, room, keep)
-    return keep
+    return DepthLimits(*variances, _TRIANGULATION.tiny, _TRIANGULATION.disparity_information)

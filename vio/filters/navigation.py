@@ -374,7 +374,7 @@ class ImuMotion:
         """
         # v = exp(phi) v_hat + xi_v
         velocity_D_error = np.concatenate([-so3_hat(nav.velocity), _I3], axis=1)
-        sigmas = np.sqrt(np.diag(P)[9:15])
+        sigmas = np.sqrt(P.diagonal()[9:15])
         return MotionUncertainty(
             velocity_D_error @ P[3:9, 3:9] @ velocity_D_error.T, sigmas[:3], sigmas[3:]
         )
@@ -390,7 +390,7 @@ class ImuMotion:
         if len(self._chosen):
             by_terms = error[DIM : DIM + len(self._chosen)]
             # exact, as the rate is linear in the terms
-            rate = rate + self.rate_D_error(nav)[:, DIM:] @ by_terms
+            rate = rate + self._rate_D_terms(nav, nav.rate + nav.gyro_bias) @ by_terms
             terms = terms.copy()
             terms[self._chosen] += by_terms
         return NavState(

@@ -118,6 +118,7 @@ def _scale_sigma(window: Window) -> float:
     """The larger one of the standard deviations of baseline and focal length, over them; 0 where
     they are known.
     """
-    if "stereo_scale" not in window.state:
+    if "stereo_scale" not in window.state.blocks:
         return 0.0
-    return float(np.sqrt(window.prior.P.diagonal()[window.state["stereo_scale"]].max(initial=0.0)))
+    variances = window.prior.P.diagonal()[window.state.blocks["stereo_scale"]]
+    return float(np.sqrt(variances.max(initial=0.0)))

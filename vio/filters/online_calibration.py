@@ -131,7 +131,7 @@ class Calibration:
     @property
     def moves_camera(self) -> bool:
         """Whether anything is estimated that stands between the body's pose and the camera's."""
-        return any(BLOCKS[name].enters == "camera" for name in self.estimated)
+        return _moves_camera(tuple(self.estimated))
 
     @property
     def stereo_terms(self) -> IntArray:
@@ -150,12 +150,17 @@ class Calibration:
         """Return the calibration moved by an error (C,), the body's pose (4, 4) being that of
         the error.
         """
-        changed: dict[str, Any] = {}
+        changed: dict[str, Any] = {
+            "T_cam0_imu": self.T_cam0_imu,
+            "time_offset_s": self.time_offset_s,
+            "stereo": self.stereo,
+            "R_upright_world": self.R_upright_world,
+        }
         first = 0
         for name, size in self.estimated.items():
             BLOCKS[name].correct(self, error[first : first + size], T_world_imu, changed)
             first += size
-        return replace(self, **changed)
+        return Calibration(**changed, estimated=self.estimated)
 
     def variances(self, of_block: dict[str, FloatArray]) -> FloatArray:
         """Join variances, given by block, of the blocks that are estimated (C,)."""
@@ -168,15 +173,16 @@ class Calibration:
         out = np.diag(variances)
         first = 0
         for name, size in self.estimated.items():
-            moved = BLOCKS[name].moved_by(T_world_imu)
-            if moved is not None:
+            block = BLOCKS[name]
+            if block.is_in_world:
+                moved = block.moved_by(T_world_imu)
                 own = slice(first, first + size)
                 out[own, own] = moved @ out[own, own] @ moved.T
             first += size
         return out
 
     def transition(
-        self, state: OwnRows, step: Transition | Growth, T_moved: FloatArray
+        self, state: OwnRows, step: Transition | Growth, T_after: FloatArray, T_before: FloatArray
     ) -> FloatArray:
         """Transition (15 + C, 15 + C) of the errors of navigation state and calibration, equation
         (C4).
@@ -184,16 +190,18 @@ class Calibration:
         Args:
             state: their rows.
             step: of the navigation state.
-            T_moved: (4, 4) the body's motion over it, on the world's side.
+            T_after: (4, 4) the body's pose behind it.
+            T_before: likewise before it.
         """
-        out = np.eye(state.own.stop)
+        out = state.own_identity.copy()
         out[:DIM, :DIM] = step.Phi
         if step.Phi_imu is not None:
-            out[:DIM, state["imu_terms"]] = step.Phi_imu
+            out[:DIM, state.blocks["imu_terms"]] = step.Phi_imu
         for name in self.estimated:
-            moved = BLOCKS[name].moved_by(T_moved)
-            if moved is not None:
-                out[state[name], state[name]] = moved
+            block = BLOCKS[name]
+            if block.is_in_world:
+                moved = block.moved_by(T_after @ se3_inverse(T_before))
+                out[state.blocks[name], state.blocks[name]] = moved
         return out
 
     def report(self, state: OwnRows, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
@@ -202,7 +210,7 @@ class Calibration:
         """
         out: dict[str, Any] = {}
         for name in self.estimated:
-            rows = state[name]
+            rows = state.blocks[name]
             out |= BLOCKS[name].report(self, nav, covariance[rows, rows])
         return out
 
@@ -217,13 +225,18 @@ def _stereo_terms(names: tuple[str, ...]) -> IntArray:
     return np.concatenate([np.arange(0), *terms])
 
 
+@lru_cache(maxsize=8)
+def _moves_camera(names: tuple[str, ...]) -> bool:
+    """Whether one of the blocks of given names enters in the camera's pose."""
+    return any(BLOCKS[name].enters == "camera" for name in names)
+
+
 class OwnRows(Protocol):
     """Rows of an error vector, as far as the calibration needs them: see `ErrorState`."""
 
     own: slice  # of navigation state and calibration
-
-    def __getitem__(self, name: str) -> slice:
-        """Rows of a block."""
+    own_identity: FloatArray  # (15 + C, 15 + C) the identity, not to be changed
+    blocks: dict[str, slice]  # rows of each, by name
 
 
 class CalibrationBlock:
@@ -234,6 +247,8 @@ class CalibrationBlock:
     # exposure.
     enters: ClassVar[Literal["motion", "pixels", "camera"]]
     walk: ClassVar[float] = 0.0  # random walk per root second, over the initial standard deviation
+    # Whether its errors are kept on the world's side, and so follow the body's motions.
+    is_in_world: ClassVar[bool] = False
 
     def size(self, settings: MsckfSettings) -> int:
         """How many errors (n) it has."""
@@ -271,12 +286,11 @@ class CalibrationBlock:
         """
         raise NotImplementedError
 
-    def moved_by(self, T: FloatArray) -> FloatArray | None:
-        """How its errors follow a motion (4, 4) of the body on the world's side (n, n).
-
-        None: not.
+    def moved_by(self, T: FloatArray) -> FloatArray:
+        """How its errors follow a motion (4, 4) of the body on the world's side (n, n), where they
+        are kept there.
         """
-        return None
+        raise NotImplementedError
 
     def camera_D_error(
         self,
@@ -323,7 +337,8 @@ class _ImuTermsBlock(CalibrationBlock):
     def report(
         self, calibration: Calibration, nav: NavState, covariance: FloatArray
     ) -> dict[str, Any]:
-        sigmas = np.sqrt(np.diag(all_imu_terms(covariance)))
+        sigmas = np.zeros(IMU_TERMS)
+        sigmas[_estimated_terms(len(covariance))] = np.sqrt(covariance.diagonal())
         return {"imu_terms": nav.imu_terms, "imu_terms_sigma": sigmas}
 
 
@@ -344,7 +359,7 @@ class StereoBlock(CalibrationBlock):
         changed: dict[str, Any],
     ) -> None:
         """Put the coefficients moved by an error (n,) of some of them into `changed`."""
-        if "stereo" not in changed:
+        if changed["stereo"] is calibration.stereo:
             changed["stereo"] = calibration.stereo.copy()
         changed["stereo"][self.terms] += error
 
@@ -397,6 +412,7 @@ class _ExtrinsicsBlock(CalibrationBlock):
 
     name = "extrinsics"
     enters = "camera"
+    is_in_world = True
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
         return motion == "imu" and settings.calibrate_camera_imu in ("extrinsics", "both")
@@ -429,7 +445,7 @@ class _ExtrinsicsBlock(CalibrationBlock):
             "T_cam0_imu_covariance": back @ covariance @ back.T,
         }
 
-    def moved_by(self, T: FloatArray) -> FloatArray | None:
+    def moved_by(self, T: FloatArray) -> FloatArray:
         return se3_adjoint(T)
 
     def camera_D_error(
@@ -556,6 +572,12 @@ def all_imu_terms(covariance: FloatArray) -> FloatArray:
     zeros.
     """
     out = np.zeros((IMU_TERMS, IMU_TERMS))
-    chosen = next(rows for rows in CHOSEN.values() if len(rows) == len(covariance))
-    out[np.ix_(chosen, chosen)] = covariance
+    chosen = _estimated_terms(len(covariance))
+    out[chosen[:, None], chosen] = covariance
     return out
+
+
+@lru_cache(maxsize=8)
+def _estimated_terms(count: int) -> IntArray:
+    """Which of the IMU's terms are estimated, by how many."""
+    return next(rows for rows in CHOSEN.values() if len(rows) == count)

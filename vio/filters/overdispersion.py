@@ -101,7 +101,8 @@ class Overdispersion:
             self._scores[row] = 0.0
         known = self._information > 0
         if known.any():
-            ratio = float((self._squares[known] / self._information[known]).mean())
+            ratios = self._squares[known] / self._information[known]
+            ratio = float(ratios.sum() / len(ratios))
             learned = (_CLUSTERS.prior_tracks * PRIOR_FACTOR + self._tracks * ratio) / (
                 _CLUSTERS.prior_tracks + self._tracks
             )

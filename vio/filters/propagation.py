@@ -11,6 +11,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.errors import EstimationError
+from vio.filters.error_state import ErrorState
 from vio.filters.navigation import (
     DIM,
     NO_STEP,
@@ -128,6 +129,8 @@ class Propagation:
         self.since_frame = NO_STEP  # how the error has grown since then
         self.gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
         self._coming: _Coming | None = None  # the step that `predict` has integrated
+        # the last transition since the last frame, and of what
+        self._grown: tuple[NavState, Growth, FramePosterior, ErrorState, FloatArray] | None = None
         self._twist: tuple[NavState, Growth, Twist] | None = None  # the last one, and of what
         # too
         self._camera: (
@@ -230,7 +233,7 @@ class Propagation:
 
     def body_time(self, window: Window, time_ns: int) -> int:
         """The time on the IMU's clock to which the navigation state is carried for a frame."""
-        if "time_offset" not in window.state or not isinstance(self.motion, ImuMotion):
+        if "time_offset" not in window.state.blocks or not isinstance(self.motion, ImuMotion):
             return time_ns
         return self.motion.covered(time_ns + round(1e9 * window.calibration.time_offset_s))
 
@@ -295,7 +298,7 @@ class Propagation:
         twist = self.twist(window, nav, growth)
         if last is None or last[0] is not nav or last[1] is not growth or last[2] != late_s:
             T, J = window.camera_at(late_s, twist, nav)
-            if not window.calibration.moves_camera and "imu_terms" not in window.state:
+            if not window.calibration.moves_camera and "imu_terms" not in window.state.blocks:
                 M = growth.Phi[:6] - _POSE
                 P = self.posterior.own[:DIM, :DIM]
                 moved = M @ P @ M.T + growth.Q[:6, :6]
@@ -312,12 +315,22 @@ class Propagation:
         """Transition (15 + C, 15 + C) of the errors of navigation state and calibration since
         the last frame.
         """
-        T_moved = nav.T_world_imu @ se3_inverse(self.posterior.T_world_imu)
-        return window.calibration.transition(window.state, growth, T_moved)
+        known = self._grown
+        if (
+            known is None
+            or known[0] is not nav
+            or known[1] is not growth
+            or known[2] is not self.posterior
+            or known[3] is not window.state
+        ):
+            T_before = self.posterior.T_world_imu
+            out = window.calibration.transition(window.state, growth, nav.T_world_imu, T_before)
+            known = self._grown = nav, growth, self.posterior, window.state, out
+        return known[4]
 
     def twist(self, window: Window, nav: NavState, growth: Growth) -> Twist:
         """The body's twist, and how well it is known; equation (C3)."""
-        if not isinstance(self.motion, ImuMotion) or "time_offset" not in window.state:
+        if not isinstance(self.motion, ImuMotion) or "time_offset" not in window.state.blocks:
             return NO_TWIST
         if self._twist is not None and self._twist[0] is nav and self._twist[1] is growth:
             return self._twist[2]
@@ -365,8 +378,8 @@ class Propagation:
             window: the window.
             own: `own_covariance`.
         """
-        if "time_offset" not in window.state:
-            J = window.since_first(np.eye(6, len(own)))
+        if "time_offset" not in window.state.blocks:
+            J = window.since_first(window.state.own_identity[:6])
             return window.nav.T_world_imu, J @ own @ J.T
         if not self.blind:
             with_newest = self.reported.with_newest
@@ -377,8 +390,8 @@ class Propagation:
         T, J, noise = window.camera_D_own(
             self.late_s, self.twist(window, window.nav, self.since_frame)
         )
-        if "extrinsics" in window.state:
-            J[:, window.state["extrinsics"]] = 0.0  # of the body
+        if "extrinsics" in window.state.blocks:
+            J[:, window.state.blocks["extrinsics"]] = 0.0  # of the body
         J = window.since_first(J)
         return T, J @ own @ J.T + noise
 

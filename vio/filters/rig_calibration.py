@@ -47,6 +47,8 @@ class _RigRules(NamedTuple):
 
 
 _RIG = _RigRules()
+_NO_ROWS: FloatArray = np.zeros(ROW_TERMS)
+_NO_COLUMNS: FloatArray = np.zeros((ROW_TERMS, 0))
 # root mean square of a rows' field that says no more of the columns than their least prior does, in
 # focal lengths
 _LEAST_ROWS = MIN_FIELD_SIGMA / _RIG.columns_by_rows
@@ -159,7 +161,7 @@ class RigCalibration:
         """Begin to test the scale beside the states of a window without clones, with what a test
         before has found.
         """
-        if source is not None and "stereo_scale" not in window.state:
+        if source is not None and "stereo_scale" not in window.state.blocks:
             window.prior.scale_test = ScaleTest() if before is None else before
 
     def learn_rows(self, window: Window, seen: Observations) -> None:
@@ -177,17 +179,17 @@ class RigCalibration:
             return
         moved_px = self._rows.moved_px
         if (
-            "stereo_field" in window.state
+            "stereo_field" in window.state.blocks
             and moved_px > _RIG.rows_moved_sigmas * _LEAST_ROWS * self.camera.fu
         ):
             # A turn of which the rows show this part moves columns as much.
             sigmas = field_sigmas(self.camera, moved_px, stereo_yaw_rad(self.settings))
-            window.prior.inflate(window.state["stereo_field"], sigmas**2)
+            window.prior.inflate(window.state.blocks["stereo_field"], sigmas**2)
             self._rows.forget()
             self._rows.update(seen)
             return
         off = rows_off(self.camera, self._rows.offset_px)
-        begins = "stereo_field" not in window.state
+        begins = "stereo_field" not in window.state.blocks
         if not begins and off <= _RIG.rows_moved_sigmas * self._rows_off:
             return
         yaw_rad = stereo_yaw_rad(self.settings)
@@ -197,7 +199,8 @@ class RigCalibration:
             window.estimate_block("stereo_field", calibration, np.diag(variances))
         else:
             window.prior.inflate(
-                window.state["stereo_field"], np.maximum(variances - self._field_variances, 0.0)
+                window.state.blocks["stereo_field"],
+                np.maximum(variances - self._field_variances, 0.0),
             )
         self._field_variances, self._rows_off = variances, max(off, self._rows_off)
 
@@ -214,9 +217,9 @@ class RigCalibration:
         """Standard deviations (4,) as `constant_sigmas` returns them; zero where one is
         estimated.
         """
-        return (
-            self._sigmas * [0.0, 0.0, 1.0, 1.0] if "stereo_scale" in window.state else self._sigmas
-        )
+        if "stereo_scale" in window.state.blocks:
+            return self._sigmas * [0.0, 0.0, 1.0, 1.0]
+        return self._sigmas
 
     def uncertainty(self, window: Window, V: FloatArray) -> FloatArray:
         """What the constants considered add to a covariance (..., k, k), by how its errors
@@ -230,7 +233,7 @@ class RigCalibration:
         """By what motion sensor and field suggest that the baseline is off, as a standard deviation
         over it, beside the one considered; 0 where the settings say that it is known.
         """
-        if self._sigmas[0] == 0.0 or "stereo_scale" in window.state:
+        if self._sigmas[0] == 0.0 or "stereo_scale" in window.state.blocks:
             return 0.0
         test = window.prior.scale_test
         by_sensor = 0.0 if test is None else test.doubt()
@@ -238,9 +241,9 @@ class RigCalibration:
 
     def _field_doubt(self, window: Window) -> float:
         """What `field_doubt` returns of a window."""
-        if "stereo_field" not in window.state:
+        if "stereo_field" not in window.state.blocks:
             return 0.0
-        rows = window.state["stereo_field"]
+        rows = window.state.blocks["stereo_field"]
         covariance = window.prior.P[rows, rows]
         return field_doubt(self.camera, self.settings, window.calibration.stereo, covariance)
 
@@ -269,16 +272,17 @@ class RigCalibration:
     def _field_at(self, window: Window) -> StereoCorrection | None:
         estimated = window.calibration.stereo_terms
         stereo = window.calibration.stereo
+        blocks = window.state.blocks
         if not len(estimated):
             return None
-        rows = np.zeros(ROW_TERMS)
-        rows_D_common = np.zeros((ROW_TERMS, 0))
-        if "stereo_field" in window.state:
+        rows = _NO_ROWS
+        rows_D_common = _NO_COLUMNS
+        if "stereo_field" in blocks:
             rows = self._rows.coefficients
         # Lenses that bend both images alike pass for a focal length: 2 ± 0.4 % for k1 = -0.03.
         # Where that counts as known, drives come out no better without their part of the rows:
         # KITTI 03 by 20 %, 06 and 0039 not.
-        if "stereo_field" in window.state and "stereo_scale" in window.state:
+        if "stereo_field" in blocks and "stereo_scale" in blocks:
             rows = self._rows.without_common(stereo)
             rows_D_common = self._rows.rows_D_common
         return StereoCorrection(self.camera, rows, stereo, estimated, rows_D_common)

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.filters import pose_loops as loops
-from vio.filters.navigation import NavState
 from vio.geometry.lie import FloatArray
 from vio.numerics.statistics import squared_distance
 
@@ -60,12 +59,12 @@ def is_clear(velocity: FloatArray, covariance: FloatArray) -> bool:
     return squared_distance(velocity, covariance, 1e-18) > _SCALE.clear_squared_sigmas
 
 
-def scaled_nav(nav: NavState, T_cam0_imu: FloatArray) -> FloatArray:
-    """How the navigation state's error (15,) moves with the logarithm of the world's scale,
-    equation (S1).
+def scaled_nav(T_world_imu: FloatArray, velocity: FloatArray, T_cam0_imu: FloatArray) -> FloatArray:
+    """How the error (15,) of a navigation state, of pose (4, 4) and velocity (3,), moves with the
+    logarithm of the world's scale, equation (S1).
     """
     out: FloatArray = np.empty(15)
-    loops.scale_nav(nav.T_world_imu, T_cam0_imu, nav.velocity, out)
+    loops.scale_nav(T_world_imu, T_cam0_imu, velocity, out)
     return out
 
 

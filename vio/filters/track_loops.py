@@ -658,17 +658,17 @@ def refine(
     views: Views,
     steps: int,
     damping: Damping,
-    at: Residuals,
-    q: InverseDepth,
     p: FloatArray,
 ) -> None:
     """Move points (F, 3) by Gauss-Newton steps in the coordinates (M5), each after what is
     behind was put ahead.
-
-    `at` and `q` are room for the residuals and the coordinates of the last step.
     """
-    seen = np.empty(views.weight.shape[:2], np.bool_)
+    F, N = views.weight.shape[:2]
+    seen = np.empty((F, N), np.bool_)
     dq = np.empty(p.shape)
+    ahead = np.empty(F, np.bool_)
+    at = Residuals(np.empty((F, N, 4)), np.empty((F, N, 4, 3)), ahead, views.weight)
+    q = _room_for_points(F)
     _mark_seen(views.weight, seen)
     for _ in range(steps):
         put_ahead(cameras, damping.min_disparity, views, p)
@@ -676,6 +676,16 @@ def refine(
         anchor_points(cameras, p, seen, q)
         step_points(at, q.p_D_q, damping, dq)
         step_inverse_depths(cameras, damping.min_disparity, views.weight, q, dq, p)
+
+
+@compiled
+def _room_for_points(count: int) -> InverseDepth:
+    """Room for the coordinates of some points: `InverseDepth.empty`."""
+    p_D_q = np.empty((count, 3, 3))
+    q_D_p = np.empty((count, 3, 3))
+    return InverseDepth(
+        np.empty(count, np.int64), np.empty((count, 3)), np.empty(count), p_D_q, q_D_p
+    )
 
 
 @compiled
@@ -707,18 +717,16 @@ def mark_usable(
     p: FloatArray,
     at: Residuals,
     limits: DepthLimits,
-    q: InverseDepth,
     keep: BoolArray,
 ) -> None:
     """Write which points (F, 3) are finite, ahead of their cameras and, without a right view, fixed
     by parallax.
-
-    `q` is room for the coordinates of one point.
     """
     weight = at.weight
     J = at.z_D_p
     F, N = weight.shape[:2]
     seen = np.empty((1, N), np.bool_)
+    q = _room_for_points(1)
     C = np.empty((3, 3))
     L = np.empty((3, 3))
     row = np.empty(3)
@@ -739,6 +747,24 @@ def mark_usable(
         keep[f] = 1.0 / L[2, 2] ** 2 < (
             limits.variance + limits.relative_variance * q.disparity[0] ** 2
         )
+
+
+@compiled
+def linearise(
+    cameras: Cameras,
+    views: Views,
+    steps: int,
+    damping: Damping,
+    limits: DepthLimits,
+    out: tuple[FloatArray, Residuals, BoolArray],
+) -> None:
+    """Move points (F, 3) as `refine` does, compare their views there, and mark (F,) those to
+    use.
+    """
+    p, at, keep = out
+    refine(cameras, views, steps, damping, p)
+    compare_views(cameras, p, views, at)
+    mark_usable(cameras, p, at, limits, keep)
 
 
 @compiled
@@ -764,10 +790,13 @@ def _by_point(J: FloatArray, p_D_q: FloatArray, row: FloatArray) -> None:
 
 @compiled
 def expected_pixels(z: FloatArray, r: FloatArray, weight: FloatArray, out: FloatArray) -> None:
-    """Write the pixels (M, 4) that are expected where z was seen, of residuals times weights."""
-    for m in range(len(z)):
-        for a in range(4):
-            out[m, a] = z[m, a] - r[m, a] / weight[m, a] if weight[m, a] > 0.0 else z[m, a]
+    """Write the pixels (F, N, 4) that are expected where z was seen, of residuals times weights."""
+    for f in range(z.shape[0]):
+        for n in range(z.shape[1]):
+            for a in range(4):
+                out[f, n, a] = z[f, n, a]
+                if weight[f, n, a] > 0.0:
+                    out[f, n, a] -= r[f, n, a] / weight[f, n, a]
 
 
 @compiled

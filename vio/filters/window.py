@@ -63,8 +63,8 @@ class Clones:
     def with_newest(self, clone: Clone) -> Clones:
         """Return the clones and a newer one."""
         return Clones(
-            np.append(self.frame_indices, clone.frame_index),
-            np.append(self.times_ns, clone.time_ns),
+            np.concatenate([self.frame_indices, [clone.frame_index]]),
+            np.concatenate([self.times_ns, [clone.time_ns]]),
             np.concatenate([self.T_world_imu, clone.T_world_imu[None]]),
             np.concatenate([self.velocities, clone.velocity[None]]),
         )
@@ -122,6 +122,8 @@ class Window:
         self.landmarks: FloatArray = np.zeros((0, 3))
         self.prior = Prior(P)
         self._lay_out()
+        # the cameras' poses (N, 4, 4), of these poses of the body, by this calibration
+        self._cameras: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self.clocks_compared = False  # whether exposures follow the time offset's error, (C2)
 
     def _lay_out(self) -> None:
@@ -131,10 +133,14 @@ class Window:
 
     def T_cam0_world(self, first: int = 0) -> FloatArray:
         """Camera poses (N, 4, 4) at the exposures from one on."""
-        T = self.clones.T_world_imu[first:]
-        out: FloatArray = np.empty(T.shape)
-        loops.camera_poses(self.calibration.T_cam0_imu, T, out)
-        return out
+        T = self.clones.T_world_imu
+        T_cam0_imu = self.calibration.T_cam0_imu
+        known = self._cameras
+        if known is None or known[0] is not T or known[1] is not T_cam0_imu:
+            out: FloatArray = np.empty(T.shape)
+            loops.camera_poses(T_cam0_imu, T, out)
+            known = self._cameras = T, T_cam0_imu, out
+        return known[2][first:]
 
     def body_D_error(self) -> FloatArray:
         """Jacobian (6N, k) of the errors of the body's poses at the exposures by the first k, to
@@ -142,9 +148,10 @@ class Window:
         """
         state = self.state
         out = np.eye(6 * len(self.clones), state.clones.stop, state.clones.start)
-        if "extrinsics" in state:
+        if "extrinsics" in state.blocks:
             back = se3_inverse(self.nav.T_world_imu)
-            out[:, state["extrinsics"]] = se3_adjoint(self.clones.T_world_imu @ back).reshape(-1, 6)
+            moved = se3_adjoint(self.clones.T_world_imu @ back)
+            out[:, state.blocks["extrinsics"]] = moved.reshape(-1, 6)
         return out
 
     def camera_move_since(self, index: int) -> FloatArray:
@@ -166,15 +173,15 @@ class Window:
         state = self.state
         prior = self.prior
         before = self.nav
-        Phi = self.calibration.transition(
-            state, step, step.nav.T_world_imu @ se3_inverse(before.T_world_imu)
-        )
+        nav = step.nav
+        Phi = self.calibration.transition(state, step, nav.T_world_imu, before.T_world_imu)
         own = state.own
         T_cam0_imu = self.calibration.T_cam0_imu
         V = prior.error_D_constants
         V[own] = Phi @ V[own]
-        V[:DIM, 0] += step.Phi @ scaled_nav(before, T_cam0_imu) - scaled_nav(step.nav, T_cam0_imu)
-        self.nav = step.nav
+        scaled = scaled_nav(before.T_world_imu, before.velocity, T_cam0_imu)
+        V[:DIM, 0] += step.Phi @ scaled - scaled_nav(nav.T_world_imu, nav.velocity, T_cam0_imu)
+        self.nav = nav
         P = prior.to_change()
         P[own] = Phi @ P[own]
         P[:, own] = P[:, own] @ Phi.T
@@ -195,7 +202,7 @@ class Window:
         """
         self.calibration = calibration
         self._lay_out()
-        self.prior.insert(self.state[name].start, covariance)
+        self.prior.insert(self.state.blocks[name].start, covariance)
 
     def keep_first_attitude(self, calibration: Calibration) -> None:
         """Make a state of the oldest clone's attitude, which stays when the clone is dropped,
@@ -217,10 +224,10 @@ class Window:
         """Turn Jacobians (6k, D) of poses into those of the same in the world that is reported,
         equation (N14).
         """
-        if "first_attitude" in self.state:
+        if "first_attitude" in self.state.blocks:
             out_D_error = out_D_error.copy()
             rows = out_D_error.reshape(-1, 6, out_D_error.shape[1])
-            rows[:, 3:, self.state["first_attitude"]] -= _I3
+            rows[:, 3:, self.state.blocks["first_attitude"]] -= _I3
         return out_D_error
 
     @property
@@ -266,7 +273,7 @@ class Window:
         """
         self.clocks_compared = True
         _, camera_D_own, noise = self.camera_D_own(late_s, twist)
-        offset = self.state["time_offset"].start
+        offset = self.state.blocks["time_offset"].start
         to_nav = np.eye(self.state.size)
         moved = camera_D_own[:, offset]
         to_nav[:6, offset] = -moved
@@ -293,8 +300,10 @@ class Window:
         """
         T, camera_D_own, noise = self.camera_D_own(0.0, NO_TWIST) if exposure is None else exposure
         of_scale = self.prior.error_D_constants[self.state.own, 0].copy()
-        of_scale[:DIM] += scaled_nav(self.nav, self.calibration.T_cam0_imu)
-        scaled_clone = scaled_nav(replace(self.nav, T_world_imu=T), self.calibration.T_cam0_imu)[:6]
+        nav = self.nav
+        T_cam0_imu = self.calibration.T_cam0_imu
+        of_scale[:DIM] += scaled_nav(nav.T_world_imu, nav.velocity, T_cam0_imu)
+        scaled_clone = scaled_nav(T, nav.velocity, T_cam0_imu)[:6]
         self.prior.insert_dependent(
             self.state.clones.stop, camera_D_own, noise, camera_D_own @ of_scale - scaled_clone
         )
@@ -329,26 +338,26 @@ class Window:
         T = nav.T_world_imu
         state = self.state
         calibration = self.calibration
-        J = np.eye(6, state.own.stop)
+        J = state.own_identity[:6].copy()
         exposed = T
-        compared = self.clocks_compared and "time_offset" in state
-        if "time_offset" in state:
+        compared = self.clocks_compared and "time_offset" in state.blocks
+        if "time_offset" in state.blocks:
             exposed = T @ se3_exp(twist.mean * (calibration.time_offset_s - late_s))
         for name in calibration.estimated:
             seen = twist if compared else None
             column = BLOCKS[name].camera_D_error(calibration, T, exposed, seen)
             if column is not None:
-                J[:, state[name]] = column
+                J[:, state.blocks[name]] = column
         return exposed, J
 
     def exposure_noise(self, T_world_imu: FloatArray, late_s: float, twist: Twist) -> FloatArray:
         """Covariance (6, 6) of the camera at an exposure of the body (4, 4), by an uncertain
         twist over its offset.
         """
-        if not self.clocks_compared or "time_offset" not in self.state:
+        if not self.clocks_compared or "time_offset" not in self.state.blocks:
             return np.zeros((6, 6))
         A = se3_adjoint(T_world_imu)
-        row = self.state["time_offset"].start
+        row = self.state.blocks["time_offset"].start
         spread = float(self.prior.P[row, row]) + (self.calibration.time_offset_s - late_s) ** 2
         out: FloatArray = A @ twist.covariance @ A.T * spread
         return out
@@ -435,8 +444,8 @@ class Window:
             considered: for pixels, the part (D, 4) of the constants considered.
         """
         partly = (
-            (self.state["stereo_field"], repeated)
-            if repeated > 1 and "stereo_field" in self.state
+            (self.state.blocks["stereo_field"], repeated)
+            if repeated > 1 and "stereo_field" in self.state.blocks
             else None
         )
         self.prior.absorb(
@@ -459,7 +468,9 @@ class Window:
             and is_clear(self.nav.velocity, self.prior.P[6:9, 6:9])
         ):
             scaled = np.zeros(self.state.size)
-            scaled[:DIM] = scaled_nav(self.nav, self.calibration.T_cam0_imu)
+            nav = self.nav
+            T_cam0_imu = self.calibration.T_cam0_imu
+            scaled[:DIM] = scaled_nav(nav.T_world_imu, nav.velocity, T_cam0_imu)
         self.absorb(information, vector, scaled)
 
     def measure(self, measurement: Measurement) -> None:
@@ -475,8 +486,9 @@ class Window:
         moves = of_clones.reshape(-1, 6).copy()
         T = clones.T_world_imu.copy()
         velocities = clones.velocities
-        if "extrinsics" in state:
-            loops.add_extrinsic_moves(T, self.nav.T_world_imu, error[state["extrinsics"]], moves)
+        if "extrinsics" in state.blocks:
+            of_extrinsics = error[state.blocks["extrinsics"]]
+            loops.add_extrinsic_moves(T, self.nav.T_world_imu, of_extrinsics, moves)
         move_poses(moves, T)
         if len(self.landmarks):
             before = self._landmarks_seen()
@@ -535,8 +547,8 @@ class Window:
         M = np.eye(state.size)
         M[[5, *range(state.clones.start + 5, state.clones.stop, 6)], 3:6] += yaw_D_tilt
         in_world = [*range(0, 9, 3), *range(state.clones.start, state.size, 3)]
-        if "extrinsics" in state:
-            in_world += range(state["extrinsics"].start, state["extrinsics"].stop, 3)
+        if "extrinsics" in state.blocks:
+            in_world += range(state.blocks["extrinsics"].start, state.blocks["extrinsics"].stop, 3)
         turn = np.eye(state.size)
         for k in in_world:
             turn[k : k + 3, k : k + 3] = R

@@ -194,9 +194,8 @@ class WindowFit:
             at = self.landmark_residuals(window, pixels)
             H = np.empty((len(pixels.z), 4, 0))
             if field is not None or considered:
-                H = self.error_columns(field, considered).jacobian(
-                    unweighted(pixels.z, at.r, at.precision)
-                )
+                z = _unweighted(pixels, at)
+                H = self.error_columns(field, considered).jacobian(z)
             # In their anchor, the newest clone: dp = xi_f - xi_rho.
             rows = ErrorRows(state.clone(-1).start, state.landmarks.start, state.stereo.start)
             weighted = at._replace(weight=at.weight / self.variance)
@@ -235,7 +234,7 @@ class WindowFit:
         field = self._rig.field(window)
         if field is None:
             return at.J
-        z = unweighted(pixels.z, at.r, at.precision)
+        z = _unweighted(pixels, at)
         H = field.columns().jacobian(z) * (at.precision * np.any(at.J, axis=2))[..., None]
         return np.concatenate([at.J, H], axis=2)
 
@@ -249,3 +248,8 @@ class WindowFit:
         """Return the landmarks' pixels without the rectification error."""
         field = self._rig.field(window)
         return pixels if field is None else field.corrected(pixels)
+
+
+def _unweighted(pixels: Views, at: LandmarkResiduals) -> FloatArray:
+    """Pixels (K, 4) that are expected where landmarks were seen."""
+    return unweighted(pixels.z[None], at.r[None], at.precision[None])[0]

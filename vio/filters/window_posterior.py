@@ -48,14 +48,14 @@ class WindowPosterior:
         reported = P if reported is None else reported
         rows = window.state.clones
         own = P[rows, rows], reported[rows, rows]
-        if "extrinsics" in window.state:
+        if "extrinsics" in window.state.blocks:
             J = window.body_D_error()
             J_reported = window.since_first(J)
             own = J @ P @ J.T, J_reported @ reported @ J_reported.T
-        elif "first_attitude" in window.state:
+        elif "first_attitude" in window.state.blocks:
             since: FloatArray = np.empty(own[1].shape)
             loops.take_since_first(
-                reported, rows.start, window.state["first_attitude"].start, since
+                reported, rows.start, window.state.blocks["first_attitude"].start, since
             )
             own = own[0], since
         has_imu = isinstance(window.motion, ImuMotion)

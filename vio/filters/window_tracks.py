@@ -17,13 +17,11 @@ from vio.filters.multiview import (
     CAUCHY,
     TrackInformation,
     first_points,
-    refine_points,
-    residuals,
+    linearised_points,
     robust_weights,
     squared_residuals,
     track_information,
     unweighted,
-    usable_points,
 )
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
@@ -161,7 +159,8 @@ class WindowTracks:
             most = self._settings.max_features
             going_on = order[count:][: round(_TRACKS.going_on * most)]
             best = np.concatenate([going_on, order[:count], order[count + len(going_on) :]])[:most]
-            rows = rows[np.sort(best)]
+            best.sort()
+            rows = rows[best]
         return rows
 
     def linearise(
@@ -192,18 +191,16 @@ class WindowTracks:
             started = table.has_point[rows]
             rows = rows[started]
             views = views.take(started)
-        p = refine_points(
-            camera, T, table.points[rows], views, steps, CAUCHY * float(np.sqrt(self.variance))
-        )
-        at = residuals(camera, T, p, views)
-        keep = usable_points(camera, T, p, views, at)
+        scale_px = CAUCHY * float(np.sqrt(self.variance))
+        p, at, keep = linearised_points(camera, T, table.points[rows], views, steps, scale_px)
         table.points[rows] = p
         table.has_point[rows] = keep
         if not keep.all():
-            rows = rows[keep]
-            p = p[keep]
-            at = at.take(keep)
-            views = views.take(keep)
+            kept = keep.nonzero()[0]
+            rows = rows[kept]
+            p = p[kept]
+            at = at.take(kept)
+            views = Views(views.z[kept], views.weight[kept])
         return self._linear(T, rows, p, at, field, unweighted(views.z, at.r, at.weight))
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
@@ -434,8 +431,9 @@ def _misfit(squares: FloatArray, dof: IntArray) -> float:
     if len(squares) < MIN_TRACKS_FOR_NOISE:
         return 1.0
     k = len(squares) // 4
-    ratio = np.partition(squares / chi_square_table(0.25)[dof], k)[k]
-    return max(float(ratio), 1.0)
+    ratios = squares / chi_square_table(0.25)[dof]
+    ratios.partition(k)
+    return max(float(ratios[k]), 1.0)
 
 
 @lru_cache(maxsize=8)

@@ -278,6 +278,14 @@ def se3_exp(xi: npt.ArrayLike) -> FloatArray:
     xi = np.asarray(xi, dtype=np.float64)
     rho = xi[..., :3]
     phi = xi[..., 3:]
+    if (one := _one(phi)) is not None:
+        x, y, z, angle = one
+        a, b, c = _sinc_terms_of_one(angle)
+        T = np.zeros((4, 4))
+        T[:3, :3] = _series(x, y, z, a, b)
+        T[:3, 3] = (_series(x, y, z, b, c) @ rho[:, None])[:, 0]
+        T[3, 3] = 1.0
+        return T
     return se3_from_parts(so3_exp(phi), (so3_left_jacobian(phi) @ rho[..., None])[..., 0])
 
 

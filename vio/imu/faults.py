@@ -533,6 +533,7 @@ class _SpikeCheck:
         self._times: list[IntArray] = []
         self._changes: list[FloatArray] = []
         self._limit: _Reading | None = None  # (6,) a larger change is suspect; None: unknown
+        self._limits = np.full(6, np.inf)  # the same, infinite where unknown
         self._period_ns = 0.0
         self._until_refresh = 0
         self._faults: list[ImuFault] = []
@@ -547,10 +548,11 @@ class _SpikeCheck:
         times = times[:most]
         readings = readings[:most]
         changes = np.empty(readings.shape)
-        limit = np.array([np.inf] * 6 if self._limit is None else self._limit)
         longest = _FAULTS.long_periods * self._period_ns
         last_ns, last = self._last
-        passed = _count_plain(times, readings, last_ns, np.array(last), limit, longest, changes)
+        passed = _count_plain(
+            times, readings, last_ns, np.array(last), self._limits, longest, changes
+        )
         if passed:
             self._accept(times[:passed], changes[:passed], readings[passed - 1].tolist())
         return passed
@@ -624,9 +626,8 @@ class _SpikeCheck:
             )
             self._period_ns = median(np.diff(together[old:]))
             least = np.array(_FAULTS.spike_impulse) / max(self._period_ns * S_PER_NS, 1e-6)
-            self._limit = np.maximum(
-                _FAULTS.spike_sigmas * robust_sigmas(changed[old:]), least
-            ).tolist()
+            self._limits = np.maximum(_FAULTS.spike_sigmas * robust_sigmas(changed[old:]), least)
+            self._limit = self._limits.tolist()
 
 
 def _reading(sample: ImuSample) -> _Reading:

@@ -37,6 +37,7 @@ class _FitPriors(NamedTuple):
 _PRIORS = _FitPriors()
 # information, (6,)
 _PRIOR = _PRIORS.misfit_m**2 / np.repeat([_PRIORS.bias_mps2, _PRIORS.lever_arm_m], 3) ** 2
+_PRIOR_MATRIX = np.diag(_PRIOR)
 # information on the map's entries, (9,): keeps the fit solvable
 _MAP_PRIOR = np.full(9, _PRIORS.misfit_m**2 / 400)
 
@@ -63,10 +64,11 @@ class ForceFit:
         arm marginalised.
         """
         w = self.weight if keep is None else self.weight * keep
-        N = np.tensordot(w, self.N, 1)
+        N = (w[None] @ self.N.reshape(len(w), -1)).reshape(15, 15)
         h = w @ self.h
         c = float(w @ self.c)
-        K = np.linalg.solve(N[9:, 9:] + np.diag(_PRIOR), np.column_stack([N[9:, :9], h[9:]]))
+        right = np.concatenate([N[9:, :9], h[9:, None]], axis=1)
+        K = np.linalg.solve(N[9:, 9:] + _PRIOR_MATRIX, right)
         return (
             N[:9, :9] - N[:9, 9:] @ K[:, :9],
             h[:9] - N[:9, 9:] @ K[:, 9],

@@ -51,6 +51,7 @@ class _JitterRules(NamedTuple):
 
 
 _JITTER = _JitterRules()
+_I3 = np.eye(3)
 # of the time missed by the gyro over the stamps' deviation: 1 for jitter, 0 for true intervals
 _SLOPE = 0.7, 1.3
 
@@ -199,23 +200,28 @@ def _moments(omega: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[F
     mean_g = np.einsum("mk,mki->mi", w, gyro)
     c = omega[None] - mean_c[:, None]
     g = gyro - mean_g[:, None]
-    cw = np.swapaxes(c * w[..., None], 1, 2)
+    cw = (c * w[..., None]).swapaxes(1, 2)
     S_cc = cw @ c
     S_cg = cw @ g
-    S_gg = np.swapaxes(g * w[..., None], 1, 2) @ g
-    size = np.trace(S_gg, axis1=1, axis2=2)[:, None, None]
-    A = np.linalg.solve(S_gg + (1e-9 * size + 1e-300) * np.eye(3), np.swapaxes(S_cg, 1, 2))
-    A = np.swapaxes(A, 1, 2)
-    total = np.trace(S_cc, axis1=1, axis2=2)
+    S_gg = (g * w[..., None]).swapaxes(1, 2) @ g
+    size = _traces(S_gg)[:, None, None]
+    A = np.linalg.solve(S_gg + (1e-9 * size + 1e-300) * _I3, S_cg.swapaxes(1, 2))
+    A = A.swapaxes(1, 2)
+    total = _traces(S_cc)
     share = 1 - np.sum(A * S_cg, axis=(1, 2)) / np.maximum(total, 1e-300)
     return (
         S_cc,
         S_cg,
         S_gg,
-        np.clip(share, 0.0, 1.0),
+        np.minimum(np.maximum(share, 0.0), 1.0),
         A,
         mean_c - np.einsum("mij,mj->mi", A, mean_g),
     )
+
+
+def _traces(S: FloatArray) -> FloatArray:
+    """Traces (M,) of matrices (M, 3, 3)."""
+    return S[:, 0, 0] + S[:, 1, 1] + S[:, 2, 2]
 
 
 def judge_offset(gyro_fit: GyroFit, record: Record, least: int) -> InertialFinding | None:

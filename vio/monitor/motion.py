@@ -62,9 +62,9 @@ class CameraTwists:
         if len(rows) > _TWISTS.tracks_per_frame:
             # The same random choice of ids in every frame, so that tracks continue.
             hashed = (seen.ids[rows] * np.int64(2654435761)) & np.int64(0xFFFFFFFF)
-            rows = np.sort(
-                rows[np.argpartition(hashed, _TWISTS.tracks_per_frame)[: _TWISTS.tracks_per_frame]]
-            )
+            count = _TWISTS.tracks_per_frame
+            rows = rows[hashed.argpartition(count)[:count]]
+            rows.sort()
         kept = seen.take(rows)
         if self._kept:
             last = self._kept[-1]

@@ -104,7 +104,7 @@ class RunMonitor:
     def samples(self, samples: Iterable[MotionSample]) -> None:
         """Add motion samples; they are judged with all others before the next frame."""
         if self._silence is not None:
-            self._new += [x for x in samples if isinstance(x, ImuSample)]
+            self._new += [x for x in samples if type(x) is ImuSample]
 
     def _take_new(self, index: int, time_ns: int) -> None:
         """Judge the samples since the last frame, which a frame of this number and stamp follows."""

@@ -77,11 +77,16 @@ class Samples:
     def add(self, samples: Sequence[ImuSample]) -> None:
         """Add readings in order of time, less those that repeat the stamp of the one before."""
         last_ns = self.last_ns
-        later = []
-        for sample in samples:
-            if last_ns is None or sample.time_ns > last_ns:
-                later.append(sample)
-                last_ns = sample.time_ns
+        times = [sample.time_ns for sample in samples]
+        if times and times == sorted(set(times)) and (last_ns is None or times[0] > last_ns):
+            later = list(samples)  # as nearly always
+            last_ns = times[-1]
+        else:
+            later = []
+            for sample in samples:
+                if last_ns is None or sample.time_ns > last_ns:
+                    later.append(sample)
+                    last_ns = sample.time_ns
         if self._first_ns is None and later:
             self._first_ns = later[0].time_ns
         self.last_ns = last_ns

@@ -18,6 +18,10 @@ from vio.numerics.robust import jackknife
 
 _BLOCKS: Tolerance[int] = 10  # of the record, for the jackknife
 _STEPS: Tolerance[int] = 8  # of the linear fit, which begins at no turn
+_I3 = np.eye(3)
+# axes of a cross product: component k is that of the next and the last one, less the reverse
+_NEXT = [1, 2, 0]
+_LAST = [2, 0, 1]
 
 
 class _TurnRules(NamedTuple):
@@ -50,25 +54,35 @@ def turn_of_gyro(gyro_fit: GyroFit, R_cam0_imu: FloatArray) -> Turn:
     camera = gyro_fit.camera
     gyro = gyro_fit.gyro @ R_cam0_imu.T
     blocks = np.arange(len(weight)) * _BLOCKS // len(weight)
-    rotation, scale = _fit(camera, gyro, weight)
-    without = [_fit(camera, gyro, weight * (blocks != k))[0] for k in range(_BLOCKS)]
-    return Turn(rotation, scale, float(jackknife(without).max()))
+    kept = np.arange(-1, _BLOCKS)[:, None] != blocks  # by the first fit everything
+    rotations, scales = _fits(camera, gyro, weight * kept)
+    return Turn(rotations[0], float(scales[0]), float(jackknife(rotations[1:]).max()))
 
 
-def _fit(camera: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[FloatArray, float]:
-    """Return the rotation (3,) and the scale of rates (K, 3), means removed, by least squares."""
-    w = weight / weight.sum()
-    camera = camera - w @ camera
-    gyro = gyro - w @ gyro
-    rotation = np.zeros(3)
-    scale = 1.0
+def _fits(
+    camera: FloatArray, gyro: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the rotations (M, 3) and the scales (M,) of rates (K, 3), means removed, by least
+    squares with weights (M, K) each.
+
+    The rates' moments hold all that is needed of them, so a step does not go through the record.
+    """
+    w = weights / weights.sum(axis=1, keepdims=True)
+    weighed = np.swapaxes(gyro - (w @ gyro)[:, None], 1, 2) * w[:, None]
+    gyro_gyro = weighed @ gyro
+    gyro_camera = weighed @ camera
+    diagonal = np.arange(3)
+    total = gyro_gyro[:, diagonal, diagonal].sum(axis=1)
+    rotation = np.zeros((len(w), 3))
+    scale = np.ones(len(w))
     for _ in range(_STEPS):
-        turned = gyro @ so3_exp(rotation).T
-        moments = (w[:, None] * turned).T @ turned
-        total = float(np.trace(moments))
-        scale = float(np.sum(w[:, None] * turned * camera)) / total
-        information = total * np.eye(3) - moments
-        rotation = rotation + np.linalg.solve(information, w @ np.cross(turned, camera)) / scale
+        R = so3_exp(rotation)
+        cross = R @ gyro_camera
+        scale = cross[:, diagonal, diagonal].sum(axis=1) / total
+        torque = cross[:, _NEXT, _LAST] - cross[:, _LAST, _NEXT]  # mean of turned x camera
+        information = total[:, None, None] * _I3 - R @ gyro_gyro @ np.swapaxes(R, 1, 2)
+        turn = np.linalg.solve(information, torque[..., None])[..., 0]
+        rotation = rotation + turn / scale[:, None]
     return rotation, scale
 
 

@@ -48,30 +48,38 @@ class Loop:
         self.options = options
         _FUNCTIONS.add(function)
         self.is_called = False  # from Python
-        # of the extension module, each for arguments of other types; that of the last call first
+        # of the extension module, each for arguments of other types
         self._codes: list[Callable[..., Any]] = []
+        self._last: Callable[..., Any] = _not_found  # the code of the last call
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it."""
-        codes = self._codes
-        for code in codes:
+        try:
+            return self._last(*arguments)
+        except TypeError:  # nothing is computed yet: the arguments are of other types
+            return self._call_another(*arguments)
+
+    def _call_another(self, *arguments: Any) -> Any:
+        """Find the code for the types of a call, and call it."""
+        if not self.is_called:
+            self._find()
+        for code in self._codes:
             try:
                 found = code(*arguments)
-            except TypeError:  # nothing is computed yet: the arguments are of other types
+            except TypeError:
                 continue
-            if code is not codes[0]:
-                self._codes = [code, *(other for other in codes if other is not code)]
+            self._last = code
             return found
-        if self.is_called:
-            return self.by_numba(*arguments)
-        return self._first_call(*arguments)
+        return self.by_numba(*arguments)
 
-    def _first_call(self, *arguments: Any) -> Any:
+    def _find(self) -> None:
+        """Look for its code in the extension module."""
         self._codes = prebuilt.code_of(self.function, lambda: self.fingerprint)
-        if not self._codes and compiling.before_first_call is not None:
-            compiling.before_first_call(self.function.__module__)
+        if not self._codes:
+            if compiling.before_first_call is not None:
+                compiling.before_first_call(self.function.__module__)
+            self._last = self.by_numba
         self.is_called = True
-        return self(*arguments)
 
     @functools.cached_property
     def fingerprint(self) -> str:
@@ -105,6 +113,11 @@ class Loop:
         """Whether this process has compiled it, rather than loaded it."""
         stats = getattr(self.__dict__.get("by_numba"), "stats", None)  # none with NUMBA_DISABLE_JIT
         return stats is not None and bool(stats.cache_misses)
+
+
+def _not_found(*_: Any) -> Any:
+    """Stand for the code of a loop that was not called yet."""
+    raise TypeError
 
 
 def compiled(function: Function) -> Function:

@@ -36,6 +36,7 @@ from vio.records import (
     Event,
     FrameLog,
     FrameResult,
+    ImuSample,
     Landmarks,
     MotionSample,
     MotionSource,
@@ -413,12 +414,12 @@ def _read(events: Iterable[Event]) -> Iterator[_Read]:
     samples: list[MotionSample] = []
     start = time.perf_counter()
     for event in events:
-        if isinstance(event, StereoFrame):
+        if type(event) is ImuSample or not isinstance(event, StereoFrame):
+            samples.append(event)
+        else:
             yield _Read(samples, event, 1e3 * (time.perf_counter() - start))
             samples = []
             start = time.perf_counter()
-        else:
-            samples.append(event)
     yield _Read(samples, None, 1e3 * (time.perf_counter() - start))
 
 
