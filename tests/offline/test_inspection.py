@@ -448,4 +448,4 @@ def test_ground_truth_of_another_clock_is_named(tmp_path: Path) -> None:
     recording = open_dataset(folder).recording
     text = _reference_part(recording, recording.frame_times_ns).text
     assert "over 0 % of the frames: of another clock or recording; it begins +18.000 s" in text
-    assert "the ground truth are late by 18 s, as GPS time and UTC" in text
+    assert "the ground truth were late by 18 s (GPS time and UTC)" in text

@@ -94,9 +94,9 @@ def test_placeholders_amid_an_estimate_are_named() -> None:
 @pytest.mark.parametrize(
     ("shift_s", "words"),
     [
-        (36.9, "reference are late by 37 s, as TAI and UTC, differ"),
-        (-18.2, "reference are early by 18 s, as GPS time and UTC, or 19 s, as TAI and GPS"),
-        (7200.0, "late by 7200 s, as time zones, differ"),
+        (36.9, "reference were late by 37 s (TAI and UTC)"),
+        (-18.2, "reference were early by 18 s (GPS time and UTC) or 19 s (TAI and GPS"),
+        (7200.0, "late by 7200 s (time zones)"),
         (-START_NS / 1e9, "count from the start of a device"),
         (55.0, None),
         (7300.0, None),

@@ -52,9 +52,9 @@ def epoch_hint(own_ns: tuple[int, int], other_ns: tuple[int, int], other: str) -
     ]
     if not found:
         return ""
-    each = " or ".join(f"{abs(s)} s, as {clocks}," for s, clocks in found)
+    each = " or ".join(f"{abs(s)} s ({clocks})" for s, clocks in found)
     way = "late" if found[0][0] > 0 else "early"
-    return f"; they would overlap if the times of {other} are {way} by {each} differ"
+    return f"; they would overlap if the times of {other} were {way} by {each}"
 
 
 def _share_of_overlap(own_ns: tuple[int, int], other_ns: tuple[int, int], late_s: int) -> float:
