@@ -22,6 +22,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.numerics.kinds import Tolerance
 
 NS_PER_S = 10**9
+MAX_GYRO_BIAS_RADPS = 0.5  # no sensor that works has more
 S_PER_NS = 1.0 / NS_PER_S  # products with it and quotients by NS_PER_S differ in the last bit
 Image: TypeAlias = npt.NDArray[np.uint8]
 IntArray: TypeAlias = npt.NDArray[np.int64]

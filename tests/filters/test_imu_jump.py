@@ -103,16 +103,16 @@ def _asked(off: list[bool]) -> list[bool]:
 def test_steps_that_were_off_before_make_no_jump() -> None:
     """Axes, a scale or a clock that are wrong contradict the images in every turn."""
     asked = _asked([False] * 31 + [True] * 4)
-    assert not any(asked[:11])
+    assert not any(asked[:21])
     # the first steps of a jump are off themselves
-    assert all(asked[11:])
+    assert all(asked[21:])
     assert not any(_asked([k % 3 == 0 for k in range(90)])[21:])
 
 
 def test_few_steps_that_were_off_are_soon_forgotten() -> None:
     """More than three of the twenty steps before the newest three make the gyro a wrong one."""
     asked = _asked([40 <= k < 44 for k in range(66)])
-    assert all(asked[11:47])  # only three of the four are older than the newest
+    assert all(asked[21:47])  # only three of the four are older than the newest
     assert not any(asked[47:64])
     assert all(asked[64:])
 

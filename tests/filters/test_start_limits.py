@@ -252,7 +252,7 @@ def _doubts_bias(radps: float, steps: int = 40) -> bool:
 
 
 JUMP: dict[str, tuple[Says, float, float]] = {
-    "first steps": (lambda n: _asked([False] * int(n)), 10, 11),
+    "first steps": (lambda n: _asked([False] * int(n)), 20, 21),
     "start": (lambda n: _doubts_bias(0.1, int(n)), 30, 31),
     "steps that are off": (lambda n: not _settled([True] * int(n) + [False] * 3), 3, 4),
     "newest steps": (lambda n: not _settled([True] * int(n)), 6, 7),

@@ -259,16 +259,20 @@ def test_an_imu_that_is_found_wrong_after_the_first_minute_is_not_used_from_ther
     assert "estimated again" not in line
     first = int(line.split()[1].rstrip(":"))
     assert 160 < first < 240
-    assert {result.estimates[k].integrity for k in range(165, first)} == {"unusable"}
+    # the first steps are measured by the images, and look like those of a gyro that has jumped
+    assert "nominal" not in {result.estimates[k].integrity for k in range(161, first)}
+    assert {result.estimates[k].integrity for k in range(168, first)} == {"unusable"}
     off = np.linalg.norm(
         np.array([x.T_world_imu[:3, 3] for x in result.estimates]) - alone.positions, axis=1
     )
     sigma = [np.sqrt(np.linalg.eigvalsh(x.covariance[:3, :3])[-1]) for x in result.estimates]
     assert np.all(off[165:] < 4.0 * np.array(sigma)[165:])
-    begun = alone.T_world_body[first], alone.T_world_body[399]
+    usable = next(k for k in range(first, 400) if result.estimates[k].integrity != "unusable")
+    assert usable < first + 25
+    begun = alone.T_world_body[usable], alone.T_world_body[399]
     truth = np.linalg.inv(begun[0]) @ begun[1]
-    moved = np.linalg.inv(result.estimates[first].T_world_imu) @ result.estimates[399].T_world_imu
-    assert np.linalg.norm((moved - truth)[:3, 3]) < 0.2
+    moved = np.linalg.inv(result.estimates[usable].T_world_imu) @ result.estimates[399].T_world_imu
+    assert np.linalg.norm((moved - truth)[:3, 3]) < 0.05
 
 
 def _with_clock(flight: _Features, offset_ms: float, since: float = 0.0) -> _Features:

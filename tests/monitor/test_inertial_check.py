@@ -537,7 +537,7 @@ _IMU_NS = _EPOCH + np.arange(4000) * 5_000_000
         (
             _IMU_NS + 37 * 10**9,
             "clocks without overlap",
-            "the IMU are late by 37 s, as TAI and UTC",
+            "the IMU were late by 37 s (TAI and UTC)",
         ),
         (_IMU_NS - _EPOCH, "clocks without overlap", "count from the start of a device"),
         (_IMU_NS[:0], "clocks without overlap", "epoch"),

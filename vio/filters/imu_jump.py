@@ -32,7 +32,7 @@ from vio.filters.window_tracks import VIEW_PROBABILITY, LinearTracks, chi_square
 from vio.geometry.lie import FloatArray, length, so3_exp, so3_hat, so3_log
 from vio.numerics.kinds import Tolerance
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import BoolArray
+from vio.records import MAX_GYRO_BIAS_RADPS, BoolArray
 
 
 class _MotionRules(NamedTuple):
@@ -54,14 +54,12 @@ class _MotionRules(NamedTuple):
 
 _MOTION = _MotionRules()
 
-MAX_GYRO_BIAS_RADPS = 0.5  # no sensor that works has more
-
 
 class _JumpRules(NamedTuple):
     """When the gyro's bias has jumped."""
 
     # of a filter that has begun, after which a shock is told from what it did not know yet
-    first_steps: int = 10
+    first_steps: int = 20
     # and a bias that jumps from one that is learned
     start_steps: int = 30
     # A jump comes after steps that agreed: of so many before the newest ones (which may belong to

@@ -12,11 +12,18 @@ import numpy as np
 
 from vio.calibration.severity import rows_grade
 from vio.dataclass import dataclass
-from vio.filters.imu_jump import MAX_GYRO_BIAS_RADPS
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray, length
 from vio.numerics.robust import median
-from vio.records import NS_PER_S, BoolArray, Estimate, IntArray, Observations, UpdateReport
+from vio.records import (
+    MAX_GYRO_BIAS_RADPS,
+    NS_PER_S,
+    BoolArray,
+    Estimate,
+    IntArray,
+    Observations,
+    UpdateReport,
+)
 
 
 class _GapRules(NamedTuple):
