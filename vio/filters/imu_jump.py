@@ -172,21 +172,21 @@ class ShownMotion:
         held[:3, :3] = np.linalg.inv(self._expected[:3, :3])
         free = _MOTION.weight_of_unknown * held
         motion, P, _ = _robust_fit(old, held)
-        if not self._is_beyond(motion, P, ROTATION):
+        if not self._is_beyond(motion[ROTATION], P, ROTATION):
             return None
-        old = self._moved(old, held, shifts=False)
+        old = self._moved(motion, held, shifts=False)
         if len(old.r) < _MOTION.min_old_tracks:
             return None
         # it may be the translation instead that is not as predicted, or both
         motion, P, _ = _robust_fit(old, free)
-        is_shifted = self._is_beyond(motion, P, TRANSLATION)
+        is_shifted = self._is_beyond(motion[TRANSLATION], P, TRANSLATION)
         if is_shifted:
-            old = self._moved(old, free, shifts=True)
-        if len(old.r) < _MOTION.min_old_tracks:
-            return None
-        motion, P, left = _robust_fit(old, free if is_shifted else held)
+            old = self._moved(motion, free, shifts=True)
+            if len(old.r) < _MOTION.min_old_tracks:
+                return None
+        _, P, left = _robust_fit(old, free if is_shifted else held)
         turn = so3_log(self._turned)
-        if not self._is_beyond(np.concatenate([self._shift, turn]), P, ROTATION):
+        if not self._is_beyond(turn, P, ROTATION):
             return None
         pixels = np.any(old.D_motion[:, :, :3] != 0.0, axis=2).sum(axis=1)
         width = CAUCHY * CAUCHY * old.variance
@@ -195,27 +195,27 @@ class ShownMotion:
             return None
         return Contradiction(turn, self._shift if is_shifted else None)
 
-    def _moved(self, old: _OldTracks, information: FloatArray, *, shifts: bool) -> _OldTracks:
-        """Move the pose by Gauss-Newton steps; return the tracks where it is."""
+    def _moved(self, motion: FloatArray, information: FloatArray, *, shifts: bool) -> _OldTracks:
+        """Move the pose by Gauss-Newton steps, of which the first one (6,) is given; return the
+        tracks where it is.
+        """
         window = self._window
         for _ in range(_MOTION.max_moves):
-            if len(old.r) < _MOTION.min_old_tracks:
-                break
-            motion = _robust_fit(old, information)[0]
-            shift = motion[:3] if shifts else np.zeros(3)
-            window.move_newest(motion[3:], shift)
-            self._turned = so3_exp(motion[3:]) @ self._turned
+            shift = motion[TRANSLATION] if shifts else np.zeros(3)
+            window.move_newest(motion[ROTATION], shift)
+            self._turned = so3_exp(motion[ROTATION]) @ self._turned
             self._shift = self._shift + shift
             old = _old_tracks(self._linearise(), window.nav.T_world_imu[:3, 3])
-            if float(np.linalg.norm(motion[3:])) < _MOTION.small_turn:
+            is_small = length(motion[ROTATION]) < _MOTION.small_turn
+            if is_small or len(old.r) < _MOTION.min_old_tracks:
                 break
+            motion = _robust_fit(old, information)[0]
         return old
 
-    def _is_beyond(self, motion: FloatArray, P: FloatArray, part: slice) -> bool:
-        """Whether a part of a motion (6,) with its covariance (6, 6) is beyond what was predicted
+    def _is_beyond(self, error: FloatArray, P: FloatArray, part: slice) -> bool:
+        """Whether a part (3,) of a motion with its covariance (6, 6) is beyond what was predicted
         by far.
         """
-        error = motion[part]
         covariance = self._expected[part, part] + P[part, part]
         return float(error @ np.linalg.solve(covariance, error)) > _MOTION.sigmas**2
 
@@ -234,7 +234,7 @@ def _bias_doubt(growth: Growth, turn: FloatArray, seconds: float) -> FloatArray:
     """Return the covariance (15, 15) that a navigation state lacks after a step with a growth of
     its error, in which a bias made such a rotation.
     """
-    by_bias = growth.Phi[:, 9:12] * (float(np.linalg.norm(turn)) / seconds)
+    by_bias = growth.Phi[:, 9:12] * (length(turn) / seconds)
     out: FloatArray = by_bias @ by_bias.T
     return out
 
@@ -328,9 +328,9 @@ class GyroJump:
         self._rate = rate
         if last is None:
             return False
-        size = float(np.linalg.norm(rate))
-        before = float(np.linalg.norm(last))
-        if float(np.linalg.norm(rate - last)) < _JUMP.alike_share * max(size, before):
+        size = length(rate)
+        before = length(last)
+        if length(rate - last) < _JUMP.alike_share * max(size, before):
             return True
         return size > before and float(rate @ last) > _JUMP.alike_direction * size * before
 
@@ -352,8 +352,8 @@ class GyroJump:
             return None
         before, sigma = self._before
         self._before = None
-        changed = float(np.linalg.norm(bias - before))
-        if changed > _JUMP.changed_sigmas * float(np.linalg.norm(sigma)):
+        changed = length(bias - before)
+        if changed > _JUMP.changed_sigmas * length(sigma):
             return changed
         return None
 
