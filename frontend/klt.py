@@ -141,9 +141,9 @@ class KltFrontend:
         found, seen = follow(self._camera, previous, left, prior, expected, self._levels)
         watch.lap("track")
         problem = self._problem(frame.index, INLIER_PX)
-        seen, motion = self._static.select(problem, old, found, seen, prior, expected, images)
-        if self._static.slow is not None:
-            followed = ~self._static.slow
+        seen, motion, slow = self._static.select(problem, old, found, seen, prior, expected, images)
+        if slow is not None:
+            followed = ~slow
             old = take(old, followed)
             found = found[followed]
             seen = seen[followed]

@@ -30,8 +30,6 @@ class StaticFeatures:
         """Prepare; `right` says whether depths need a right image."""
         self._right = right
         self._scene = SceneMotion()
-        # (N,) features of the last frame that are not to be followed further; None: all are
-        self.slow: BoolArray | None = None
 
     def take_findings(self) -> tuple[Finding, ...]:
         """Return what was found since the last call."""
@@ -46,9 +44,9 @@ class StaticFeatures:
         prior: TrackPrior | None,
         expected: FloatArray,
         images: FrameImages,
-    ) -> tuple[BoolArray, Consensus | None]:
-        """Return the mask (N,) of the found features that are static, and the consensus motion
-        if there is one.
+    ) -> tuple[BoolArray, Consensus | None, BoolArray | None]:
+        """Return the mask (N,) of the found features that are static, the consensus motion if there
+        is one, and the mask (N,) of those that are not to be followed further; None: all are.
 
         Args:
             problem: camera, thresholds and random generator.
@@ -61,7 +59,7 @@ class StaticFeatures:
         """
         camera = problem.camera
         stereo = images.stereo
-        self.slow = None
+        slow: BoolArray | None = None
         rows = seen.nonzero()[0]
         has_depth = (old.has_point & (old.has_right | (not self._right.needed)))[rows]
         deep = has_depth.nonzero()[0]
@@ -86,12 +84,12 @@ class StaticFeatures:
                 images.frame.index, problem, points, motion, prior, stereo.disparity_error_px
             )
             if chosen.hidden:
-                return np.zeros(len(old), dtype=np.bool_), None
+                return np.zeros(len(old), dtype=np.bool_), None, None
             motion = chosen.motion
             kept[has_depth] = motion.inliers
             if chosen.slow is not None:
-                self.slow = np.zeros(len(old), dtype=np.bool_)
-                self.slow[rows[deep]] = chosen.slow
+                slow = np.zeros(len(old), dtype=np.bool_)
+                slow[rows[deep]] = chosen.slow
         if motion is not None and not has_depth.all():
             distance = epipolar_distance(
                 camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m
@@ -99,4 +97,4 @@ class StaticFeatures:
             kept[~has_depth] = distance <= problem.limit_px
         keep = np.zeros(len(old), dtype=np.bool_)
         keep[rows[kept]] = True
-        return keep, motion
+        return keep, motion, slow

@@ -339,10 +339,15 @@ def _read_imu(files: Sequence[Path], notes: list[str]) -> tuple[ImuRecord, Seque
     return record, (joined, *sampling_notes(record, str(gyro)))
 
 
+def _files_beside(layout: Layout, pattern: str) -> list[Path]:
+    """Return what lies beside the images under names of a pattern."""
+    folders = dict.fromkeys((layout.root, layout.base))
+    return [file for folder in folders for file in sorted(folder.glob(pattern))]
+
+
 def _other_imu_notes(layout: Layout) -> list[str]:
     """Say how to name tables that seem to be the IMU's and are not read by their names."""
-    folders = dict.fromkeys((layout.root, layout.base))
-    files = [f for folder in folders for f in sorted(folder.glob("*.[cCtT][sSxX][vVtT]"))]
+    files = _files_beside(layout, "*.[cCtT][sSxX][vVtT]")
     found = {file: names_readings(file) for file in files if file.is_file()}
     return [
         f"{file}: not read; name it {wanted} if it is the IMU's"
@@ -373,11 +378,9 @@ def _read_reference(
 
 def _other_truth_notes(layout: Layout, read: Sequence[Path]) -> list[str]:
     """Say how to name files of poses that are not read by their names."""
-    folders = dict.fromkeys((layout.root, layout.base))
-    files = [f for folder in folders for f in sorted(folder.glob("*.[tc][xus][tmv]"))]
     return [
         f"{file}: poses, not read; name it reference{file.suffix} if it is the ground truth"
-        for file in files
+        for file in _files_beside(layout, "*.[tc][xus][tmv]")
         if file not in read and _NAMED_TRUTH.search(file.stem.lower()) and is_trajectory_file(file)
     ]
 

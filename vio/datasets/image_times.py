@@ -29,8 +29,8 @@ from vio.files.text import text_lines
 from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
 from vio.records import NS_PER_S, IntArray
 
-_LEAST_LEFT_OUT = 10  # numbers between the last image and the first one of such a recording
-_LEAST_FULL = 999  # the largest number of a camera's counter has so many nines, or more
+_MIN_LEFT_OUT = 10  # numbers between the last image and the first one of such a recording
+_MIN_FULL = 999  # the largest number of a camera's counter has so many nines, or more
 TIME_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "left_images.txt")
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 _LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
@@ -369,10 +369,10 @@ def overflow_notes(pairs: ImagePairs) -> tuple[str, ...]:
     gap = int(np.argmax(steps))
     others = np.delete(steps, gap)
     begun_again = (
-        last >= _LEAST_FULL
+        last >= _MIN_FULL
         and set(str(last)) == {"9"}
         and ordered[0] <= 1
-        and steps[gap] >= _LEAST_LEFT_OUT
+        and steps[gap] >= _MIN_LEFT_OUT
         and (others == 1).all()
     )
     if not begun_again:

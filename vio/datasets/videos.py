@@ -12,7 +12,6 @@ together that have one time.
 from __future__ import annotations
 
 import contextlib
-import itertools
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,16 +141,17 @@ def _loader(file: Path) -> Callable[[int], Image]:
     import cv2
 
     capture = cv2.VideoCapture(str(file))
-    decoded = itertools.count()
+    past = 0  # frames that the decoder is past
 
     def load(frame: int) -> Image:
-        for k in decoded:
-            found, image = capture.read()
-            if not found:
-                raise UnreadableImageError(f"{file}: frame {k} cannot be decoded")
-            if k == frame:
-                return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-        raise AssertionError("numbers do not end")
+        nonlocal past
+        for _ in range(past, frame):
+            capture.grab()
+        past = frame + 1
+        found, image = capture.read()
+        if not found:
+            raise UnreadableImageError(f"{file}: frame {frame} cannot be decoded")
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
 
     return load
 
