@@ -148,6 +148,15 @@ def warped_patches(image: Image, warp: FloatArray, radius: int) -> Pixels:
     return out
 
 
+def patches_under(image: Image, warp: FloatArray, radius: int) -> Pixels:
+    """Gray levels (N, S) of an image at the pixels of `disc` under warps (N, 2, 3)."""
+    xy = disc(radius)
+    out = np.empty((len(warp), xy.shape[1]), dtype=np.float32)
+    image = np.ascontiguousarray(image)
+    _sample_all(image, _pairs(image), warp, xy, out)
+    return out
+
+
 def _pairs(image: Image) -> Pairs:
     """Each pixel of an image (H, W), row by row, and the next one, as one number; shares the
     image's memory.
@@ -276,10 +285,10 @@ def replace_templates(store: Templates, slots: IntArray, wide: Patches) -> None:
     """Prepare templates from patches (N, 2r+3, 2r+3) in rows (N,) of others."""
     radius = wide.shape[1] // 2 - 1
     columns = _Columns(store.patch, store.gradient, store.energy, store.inverse)
-    _prepare(wide, _disc_of(radius), slots, columns, store.row_inverse)
+    _prepare(wide, disc_of(radius), slots, columns, store.row_inverse)
 
 
-class _Disc(NamedTuple):
+class Disc(NamedTuple):
     """The pixels of a template."""
 
     xy: Pixels  # (2, S) as of `disc`
@@ -287,9 +296,9 @@ class _Disc(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def _disc_of(radius: int) -> _Disc:
+def disc_of(radius: int) -> Disc:
     """Return the pixels of a template with their weights."""
-    return _Disc(disc(radius), window(radius))
+    return Disc(disc(radius), window(radius))
 
 
 class _Columns(NamedTuple):
@@ -319,7 +328,7 @@ class _Aligned(NamedTuple):
 
 
 @compiled
-def _prepare(wide: Patches, of: _Disc, slots: IntArray, out: _Columns, row_inverse: Pixels) -> None:
+def _prepare(wide: Patches, of: Disc, slots: IntArray, out: _Columns, row_inverse: Pixels) -> None:
     """Write rows (N,) of the columns of templates."""
     xy = of.xy
     weights = of.weights
@@ -424,7 +433,7 @@ def align(
     image = np.ascontiguousarray(image)
     _refine(
         columns,
-        _disc_of(radius),
+        disc_of(radius),
         slots,
         (image, _pairs(image)),
         _RowPrior(expected, row_weight),
@@ -437,7 +446,7 @@ def align(
 @compiled
 def _refine(
     templates: _Columns,
-    of: _Disc,
+    of: Disc,
     slots: IntArray,
     images: tuple[Image, Pairs],
     prior: _RowPrior,

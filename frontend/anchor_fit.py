@@ -20,6 +20,7 @@ from vio.frontend.align import (
     template_points,
 )
 from vio.frontend.detect import min_distance_px
+from vio.frontend.motion_blur import MotionBlur
 from vio.frontend.outliers import Consensus
 from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import GridSettings
@@ -50,6 +51,7 @@ class AnchorFit:
         self._camera = camera
         self._grid = grid
         self._bank = bank
+        self._blur = MotionBlur(bank)
 
     def track(
         self,
@@ -59,6 +61,7 @@ class AnchorFit:
         found: FloatArray,
         seen: BoolArray,
         motion: Consensus | None,
+        step_s: float,
     ) -> Tracks:
         """Align the features with their anchors; return those kept, with their new pixels.
 
@@ -73,6 +76,7 @@ class AnchorFit:
             found: pixels (N, 2) by Lucas-Kanade.
             seen: mask (N,) of the static features that it found.
             motion: consensus motion since the previous frame, if there is one.
+            step_s: time since the previous frame.
         """
         camera = camera_args(self._camera)
         (height, width) = left.full.shape
@@ -103,6 +107,8 @@ class AnchorFit:
         slots = old.slot.take(rows)
         warp[:, :, :2] *= scale[:, None, None]
         warp[:, :, 2] = start
+        before_px = old.left.take(rows, axis=0)
+        self._blur.apply(slots, warp, (start - before_px) / step_s)
         warp, score = align(self._bank.store, slots, left.full, warp, ITERATIONS)
         change = scale_change(warp)
         change = np.maximum(change, 1.0 / change)
@@ -126,6 +132,8 @@ class AnchorFit:
         rows = rows[chosen]
         slots = slots[chosen]
         warp = warp.take(chosen, axis=0)
+        moved_px = warp[:, :, 2] - before_px.take(chosen, axis=0)
+        self._blur.learn(left.full, slots, warp, moved_px, step_s)
         rescaled = (good & (change > _ANCHORS.max_scale))[chosen]
         if rescaled.any():
             centres = rounded(warp[rescaled, :, 2])

@@ -148,7 +148,8 @@ class KltFrontend:
             found = found[followed]
             seen = seen[followed]
         watch.lap("reject")
-        tracks = self._anchor_fit.track(old, previous.left, left, found, seen, motion)
+        step_s = (frame.time_ns - previous.time_ns) * 1e-9
+        tracks = self._anchor_fit.track(old, previous.left, left, found, seen, motion, step_s)
         watch.lap("align")
         tracks = self._matcher.match(images, previous, tracks, prior, motion)
         watch.lap("stereo")

@@ -6,8 +6,9 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.frontend.align import INSIDE, cut_patches, empty_templates, replace_templates, shift_warps
+from vio.frontend.blurring import MARGIN_PX, spread_out
 from vio.frontend.columns import joined
-from vio.frontend.patches import ImageLevels
+from vio.frontend.patches import ImageLevels, Patches
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.numerics.kinds import Capacity
 from vio.records import BoolArray, Image, IntArray, SigmaArray
@@ -91,7 +92,13 @@ class AnchorBank:
 
     def __init__(self, count: int, radius_px: int) -> None:
         self.store = empty_templates(count, radius_px)
-        self._radius_px = radius_px
+        self.radius_px = radius_px
+        side = 2 * (radius_px + 1 + MARGIN_PX) + 1
+        self._sharp = np.zeros((count, side, side), np.float32)  # the patches as they were cut
+        # (M, 2) of each anchor in the image that it was cut from, px/s; NaN: not known yet
+        self.velocity: FloatArray = np.full((count, 2), np.nan)
+        # (M, 3) by which each is blurred: variances along u and v, covariance, px^2
+        self.spread: FloatArray = np.zeros((count, 3))
         self._taken = np.zeros(count, dtype=np.bool_)
 
     @classmethod
@@ -112,7 +119,18 @@ class AnchorBank:
 
     def replace(self, slots: IntArray, image: Image, centres: FloatArray) -> None:
         """Replace the anchors in slots (N,) by the patches around pixels (N, 2) of an image."""
-        replace_templates(self.store, slots, cut_patches(image, centres, self._radius_px))
+        self._sharp[slots] = cut_patches(image, centres, self.radius_px + MARGIN_PX)
+        self.velocity[slots] = np.nan
+        self.spread[slots] = 0.0
+        self.blur(slots)
+
+    def blurred(self, slots: IntArray) -> Patches:
+        """Patches (N, 2r + 3, 2r + 3) of the anchors in slots (N,), blurred by their spread."""
+        return spread_out(self._sharp, self.spread, slots)
+
+    def blur(self, slots: IntArray) -> None:
+        """Prepare the anchors in slots (N,) anew, blurred by their spread."""
+        replace_templates(self.store, slots, self.blurred(slots))
 
     def sigma(self, slots: IntArray, *, depth_image: bool) -> SigmaArray:
         """Standard deviations (N, 3) of features in slots (N,) as in `Observations`; of a depth
@@ -130,5 +148,9 @@ class AnchorBank:
 
     def _grow(self, count: int) -> None:
         """Add `count` empty slots."""
-        self.store = joined(self.store, empty_templates(count, self._radius_px))
-        self._taken = np.concatenate([self._taken, np.zeros(count, dtype=np.bool_)])
+        more = AnchorBank(count, self.radius_px)
+        self.store = joined(self.store, more.store)
+        self._sharp = np.concatenate([self._sharp, more._sharp])
+        self.velocity = np.concatenate([self.velocity, more.velocity])
+        self.spread = np.concatenate([self.spread, more.spread])
+        self._taken = np.concatenate([self._taken, more._taken])

@@ -540,7 +540,7 @@ def _anchored(scale: float = 1.0, score: float = 1.0) -> tuple[bool, bool]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(anchor_fit, "align", align)
         patch.setattr(bank, "replace", lambda *arguments: replaced.append(arguments))
-        fit.track(old, levels, levels, centres, np.ones(2, np.bool_), None)
+        fit.track(old, levels, levels, centres, np.ones(2, np.bool_), None, 0.1)
     return bool(replaced), bool(again)
 
 
