@@ -508,6 +508,28 @@ def test_camera_info_of_a_binned_part_describes_its_images(
     assert same.cam0 == whole.cam0, "images of the whole sensor are neither binned nor a part"
 
 
+@pytest.mark.parametrize("binning", [(1, 1), (2, 2)])
+def test_rectified_images_keep_their_own_principal_points(binning: tuple[int, int]) -> None:
+    """As of cameras rectified without CALIB_ZERO_DISPARITY: each has a P of its own."""
+    P_left = np.array([[400.0, 0, 320, 0], [0, 400, 240, 0], [0, 0, 1, 0]])
+    P_right = np.array([[400.0, 0, 330, -48], [0, 400, 240, 0], [0, 0, 1, 0]])
+    left = CameraInfo("t", 640, 480, "", (), P_left[:, :3], np.eye(3), P_left, binning)
+    right = replace(left, K=P_right[:, :3], P=P_right)
+    size = (640 // binning[0], 480 // binning[1])
+    rig = rig_from_camera_infos([left, right], rectified=True, image_size=size)
+    assert not rig.is_rectified
+    point = np.array([1.0, 0.5, 8.0])
+    in_right = rig.right[1] @ [*point, 1.0]
+    for camera, in_camera, P in zip(
+        rig.cameras, (point, in_right[:3]), (P_left, P_right), strict=True
+    ):
+        shown = P @ [*point, 1.0]
+        pixel = project_point(camera, in_camera)[0]
+        np.testing.assert_allclose(pixel, shown[:2] / shown[2] / binning, atol=1e-9)
+    alike = replace(right, P=P_right - [[0, 0, 10, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
+    assert rig_from_camera_infos([left, alike], rectified=True, image_size=size).is_rectified
+
+
 def test_halved_images_of_a_calibration_without_a_size_are_doubted(tmp_path: Path) -> None:
     camera = Rig.rectified(400.0, 400.0, 305.0, 250.0, 0.12, 640, 480).camera
     write_calibration(tmp_path, camera, None)

@@ -36,6 +36,7 @@ from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts
 from vio.geometry.rectify import vertical_fault
 
 _MIN_BASELINE_M = 0.005  # no stereo camera has less
+_SAME_MATRIX = 1e-6  # relative, of the two P: beyond it each rectified image has its own
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,10 +253,12 @@ def _rig(infos: Sequence[CameraInfo], *, rectified: bool) -> Rig:
     left, right = infos
     shift = _rectified_shift(left, right)
     if rectified:
-        cam = _camera(left, rectified=True)
+        cam0, cam1 = (_camera(info, rectified=True) for info in infos)
+        if not np.allclose(left.P[:, :3], right.P[:, :3], rtol=_SAME_MATRIX):
+            return Rig(cam0, cam1, se3_from_parts(np.eye(3), shift))
         with naming(left.where):
             return Rig.rectified(
-                cam.fu, cam.fv, cam.cu, cam.cv, float(-shift[0]), cam.width, cam.height
+                cam0.fu, cam0.fv, cam0.cu, cam0.cv, float(-shift[0]), cam0.width, cam0.height
             )
     R0, R1 = (
         checked_transform(np.column_stack([i.R, np.zeros(3)]), f"{i.where}, R")[:3, :3]
