@@ -4,17 +4,20 @@ baseline only the frames state.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 rosbags = pytest.importorskip("rosbags", reason="needs rosbags")
 
 from tests.bag_maker import Script  # noqa: E402
 from tests.datasets.test_bags_as_recorded import NAMES, _imu_of, _split  # noqa: E402
 from tests.datasets.test_datasets_bags import START_NS, plain_script  # noqa: E402
+from tests.same_events import assert_same_events  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
 from vio.errors import CalibrationError, DataError  # noqa: E402
 from vio.geometry.lie import se3_exp  # noqa: E402
@@ -119,3 +122,42 @@ def test_nanoseconds_that_hold_a_larger_unit_are_called_so(
     bag = _with_imu([short(time_ns) for time_ns in true]).write(tmp_path / "short")
     with pytest.raises(DataError, match=f"/imu: all its stamps .* as where {unit} were written"):
         open_dataset(bag)
+
+
+def _renamed(folder: Path) -> None:
+    (file,) = folder.glob("*.db3")
+    file.rename(folder / "drive_1.db3")
+
+
+def _killed(folder: Path) -> None:
+    """As a recorder leaves it that was killed before it had counted anything."""
+    file = folder / "metadata.yaml"
+    known = yaml.safe_load(file.read_text())
+    known["rosbag2_bagfile_information"] |= {"message_count": 0, "topics_with_message_count": []}
+    file.write_text(yaml.safe_dump(known))
+
+
+@pytest.mark.parametrize("change", [_renamed, _killed])
+def test_files_that_their_metadata_do_not_know_are_read_without(
+    change: Callable[[Path], None], tmp_path: Path
+) -> None:
+    usual = open_dataset(plain_script("db3").write(tmp_path / "usual"))
+    folder = plain_script("db3").write(tmp_path / "f")
+    change(folder)
+    assert_same_events(open_dataset(folder), usual)
+
+
+def test_a_ros_2_bag_whose_topics_have_no_message_is_that(tmp_path: Path) -> None:
+    script = plain_script("db3")
+    script.notes = [note for note in script.notes if "image" not in note.topic]
+    script.empty = [("/left/image_raw", "sensor_msgs/msg/Image")]
+    with pytest.raises(DataError, match="holds 0 image topics with messages"):
+        open_dataset(script.write(tmp_path / "f"))
+
+
+def test_a_bag_that_was_not_closed_is_called_so(tmp_path: Path) -> None:
+    whole = plain_script("bag").write(tmp_path / "whole.bag").read_bytes()
+    file = tmp_path / "drive.bag.active"
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DataError, match=r"rosbag reindex, and rename it to .bag"):
+        open_dataset(file)
