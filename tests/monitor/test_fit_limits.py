@@ -221,6 +221,8 @@ def _jitters(
 
 GYRO: dict[str, tuple[Says, float, float]] = {
     "disagrees": (lambda x: _gyro_says(x) == ["gyro disagrees"], 0.45, 0.55),
+    # 0.3 + 0.84**2 is 1
+    "worse than none": (lambda x: _gyro_says(0.3, x) == ["gyro disagrees"], 0.78, 0.89),
     "clipped": (lambda x: _gyro_says(excess=x, clipped=True) == [], 0.55, 0.45),
     "brief": (lambda x: _gyro_says(excess=x, count=30) == [], 0.77, 0.63),
     "agrees": (lambda x: not _agrees(x), 0.17, 0.23),

@@ -228,6 +228,19 @@ def test_poor_sensor_gives_no_finding() -> None:
     assert _watch(it, samples=poor) == []
 
 
+@pytest.mark.parametrize("seconds", [6.5, 9.5, 12.5])
+@pytest.mark.parametrize(("name", "seed"), [("room", 0), ("room", 1), ("slow", 2)])
+def test_readings_of_another_time_are_found_wrong(name: str, seed: int, seconds: float) -> None:
+    """Some offset and some linear map explain half of them by chance, and the given axes nothing."""
+    it = _recording(name, seed)
+    later = [*it.samples[round(200 * seconds) :], *it.samples[: round(200 * seconds)]]
+    samples = [
+        replace(own, gyro=other.gyro, accel=other.accel)
+        for own, other in zip(it.samples, later, strict=True)
+    ]
+    assert "gyro disagrees" in _faults(_watch(it, samples=samples))
+
+
 # Units, signs, axes
 
 _CYCLE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])

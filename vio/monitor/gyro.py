@@ -24,6 +24,8 @@ class _ExcessRules(NamedTuple):
 
     # share of the rotation that the best linear map leaves unexplained
     disagreeing_share: float = 0.5
+    # likewise that the gyro as it is given leaves: one that never turns leaves 1
+    worse_than_none: float = 1.0
     # excess allowed where readings are clipped, which rotates and shortens the gyro's rates
     clipped_share: float = 0.5
     brief_share: float = 0.7  # likewise with fewer intervals than in the first evaluation
@@ -57,7 +59,13 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     limit = max(
         gyro_fit.tolerance, _EXCESS.clipped_share * evidence.clipped, _EXCESS.brief_share * brief
     )
-    if gyro_fit.unexplained > AGREES or gyro_fit.excess(R, 1.0) < limit:
+    excess = gyro_fit.excess(R, 1.0)
+    if gyro_fit.unexplained > AGREES:
+        # the best map may be chance, as where clocks are far apart: what is given is not
+        misfit = gyro_fit.unexplained + excess**2
+        is_off = misfit > _EXCESS.worse_than_none and not (brief or evidence.clipped)
+        return [_disagreement(gyro_fit)] if is_off else []
+    if excess < limit:
         return []
     if gyro_fit.fits(R):
         return _judge_scale(evidence, R)
