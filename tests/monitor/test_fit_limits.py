@@ -162,7 +162,12 @@ FORCE: dict[str, tuple[Says, float, float]] = {
 
 
 def _gyro_says(
-    unexplained: float = 0.0, excess: float = 0.0, *, clipped: bool = False, count: int = 100
+    unexplained: float = 0.0,
+    excess: float = 0.0,
+    *,
+    clipped: bool = False,
+    count: int = 100,
+    last: bool = False,
 ) -> list[str]:
     fit: Any = SimpleNamespace(
         unexplained=unexplained,
@@ -174,7 +179,7 @@ def _gyro_says(
         S_cc=I3,
         S_gg=I3,
     )
-    evidence = _evidence(gyro_fit=fit, clipped=clipped)
+    evidence = _evidence(gyro_fit=fit, clipped=clipped, last=last)
     return [f.fault for f in gyro.judge_gyro(evidence, 1.0)]
 
 
@@ -221,8 +226,10 @@ def _jitters(
 
 GYRO: dict[str, tuple[Says, float, float]] = {
     "disagrees": (lambda x: _gyro_says(x) == ["gyro disagrees"], 0.45, 0.55),
-    # 0.3 + 0.84**2 is 1
-    "worse than none": (lambda x: _gyro_says(0.3, x) == ["gyro disagrees"], 0.78, 0.89),
+    # 0.3 + 0.775**2 is 0.9
+    "as none": (lambda x: _gyro_says(0.3, x) == ["gyro disagrees"], 0.73, 0.82),
+    "as none: short": (lambda n: _gyro_says(0.3, 1.0, count=int(n), last=True) != [], 19, 20),
+    "as none: end": (lambda last: _gyro_says(0.3, 1.0, count=20, last=last > 0.5) != [], 0, 1),
     "clipped": (lambda x: _gyro_says(excess=x, clipped=True) == [], 0.55, 0.45),
     "brief": (lambda x: _gyro_says(excess=x, count=30) == [], 0.77, 0.63),
     "agrees": (lambda x: not _agrees(x), 0.17, 0.23),

@@ -228,6 +228,15 @@ def test_poor_sensor_gives_no_finding() -> None:
     assert _watch(it, samples=poor) == []
 
 
+@pytest.mark.parametrize("count", [30, 45, 60])
+def test_a_gyro_that_rests_while_the_camera_turns_is_named_in_a_short_recording(count: int) -> None:
+    it = _recording("room", 1)
+    frames = it.frames[120 : 120 + count]
+    noise = np.random.default_rng(0)
+    resting = _gyro(it, lambda w: noise.normal([0.01, -0.02, 0.01], 0.005))
+    assert "gyro disagrees" in _faults(_watch(it, frames=frames, samples=resting))
+
+
 @pytest.mark.parametrize("seconds", [6.5, 9.5, 12.5])
 @pytest.mark.parametrize(("name", "seed"), [("room", 0), ("room", 1), ("slow", 2)])
 def test_readings_of_another_time_are_found_wrong(name: str, seed: int, seconds: float) -> None:

@@ -25,7 +25,8 @@ class _ExcessRules(NamedTuple):
     # share of the rotation that the best linear map leaves unexplained
     disagreeing_share: float = 0.5
     # likewise that the gyro as it is given leaves: one that never turns leaves 1
-    worse_than_none: float = 1.0
+    as_none: float = 0.9
+    min_intervals: int = 20  # that show the latter at the end of a short run
     # excess allowed where readings are clipped, which rotates and shortens the gyro's rates
     clipped_share: float = 0.5
     brief_share: float = 0.7  # likewise with fewer intervals than in the first evaluation
@@ -54,17 +55,17 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     if evidence.turn is not None:
         C = so3_exp(evidence.turn.rotation) @ R
         return [turned_finding(evidence.turn, R), *_judge_scale(evidence, C)]
-    if gyro_fit.unexplained > _EXCESS.disagreeing_share:
-        return [] if brief else [_disagreement(gyro_fit)]
+    excess = gyro_fit.excess(R, 1.0)
+    if gyro_fit.unexplained > AGREES:
+        # the best map may be chance, as where clocks are far apart; what is given is not
+        misfit = gyro_fit.unexplained + excess**2
+        enough = not brief or (evidence.last and gyro_fit.count >= _EXCESS.min_intervals)
+        is_none = misfit > _EXCESS.as_none and enough
+        is_off = gyro_fit.unexplained > _EXCESS.disagreeing_share and not brief
+        return [_disagreement(gyro_fit)] if is_off or (is_none and not evidence.clipped) else []
     limit = max(
         gyro_fit.tolerance, _EXCESS.clipped_share * evidence.clipped, _EXCESS.brief_share * brief
     )
-    excess = gyro_fit.excess(R, 1.0)
-    if gyro_fit.unexplained > AGREES:
-        # the best map may be chance, as where clocks are far apart: what is given is not
-        misfit = gyro_fit.unexplained + excess**2
-        is_off = misfit > _EXCESS.worse_than_none and not (brief or evidence.clipped)
-        return [_disagreement(gyro_fit)] if is_off else []
     if excess < limit:
         return []
     if gyro_fit.fits(R):
