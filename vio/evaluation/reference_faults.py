@@ -129,7 +129,9 @@ def _beside_arm(
         scaled: whether s is free.
         arm: whether l is free; otherwise it is zero.
     """
-    R, t, s = start.R, start.t, start.scale
+    R = start.R
+    t = start.t
+    s = start.scale
     lever: FloatArray = np.zeros(3)
     for _ in range(_FAULT.fits):
         turned = s * np.einsum("ij,mj->mi", R, T_est[:, :3, 3] + T_est[:, :3, :3] @ lever)
