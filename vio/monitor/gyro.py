@@ -33,6 +33,7 @@ class _ExcessRules(NamedTuple):
 
 
 _EXCESS = _ExcessRules()
+_POWER_OF_TEN = 0.02  # of the decimal logarithm of a factor that is one: 5 %
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +167,9 @@ def _judge_scale(evidence: Evidence, C: FloatArray) -> list[InertialFinding]:
         1e-3: "the gyro is in mrad/s: divide its readings by 1000",
     }
     odd = "the gyro's scale is wrong, or the camera's focal length is; rad/s are expected"
+    power = round(float(np.log10(scale)))
+    if power != 0 and abs(np.log10(scale) - power) < _POWER_OF_TEN:
+        odd += f"; or all times, of images and IMU, are {10.0**-power:g} times the true ones (their unit)"
     factor = next((factor for factor in named if abs(np.log(scale / factor)) < 0.15), None)
     return [
         InertialFinding("gyro units", seen, odd if factor is None else named[factor], factor=factor)
