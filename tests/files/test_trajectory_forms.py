@@ -21,6 +21,7 @@ from vio.geometry.lie import (
     se3_from_parts,
     so3_exp,
 )
+from vio.offline.convert_trajectory import convert_trajectory
 from vio.records import Trajectory
 
 COUNT = 60
@@ -337,3 +338,13 @@ def test_a_counter_of_32_bits_that_begins_again_is_named(unit_ns: int, unit: str
         check_increasing(unit_ns * counted, lambda k: f"line {k}")
     with pytest.raises(DataError, match="remove or reorder that entry"):
         check_increasing(unit_ns * (counted * 97 // 100), lambda k: f"line {k}")
+
+
+@pytest.mark.parametrize("header", ["", "#timestamp [ns],x,y,z,qw,qx,qy,qz"])
+def test_an_order_that_is_assumed_is_named_where_poses_are_converted(
+    header: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = _write(tmp_path / "poses.csv", header, NS, WXYZ, ",")
+    written = convert_trajectory(file, tmp_path / "poses.tum", "tum")
+    np.testing.assert_allclose(written.T_world_body, TRUTH.T_world_body, atol=1e-12)
+    assert ("does not state the order of its quaternions" in caplog.text) is (header == "")
