@@ -186,7 +186,7 @@ def test_run_and_its_kitti_file_are_compared_in_one_world(
     )
 
 
-def test_reference_of_another_recording_is_noted(
+def test_a_reference_of_other_lengths_is_noted(
     recording: Path,
     truth: Path,
     tmp_path: Path,
@@ -198,9 +198,9 @@ def test_reference_of_another_recording_is_noted(
     np.savetxt(tmp_path / "other.txt", poses)
     out = str(tmp_path / "out")
     metrics = json_of(capsys, "run", recording, "--reference", tmp_path / "other.txt", "--out", out)
-    assert "is it the reference of this recording?" in metrics["evaluation"]["notes"][0]
+    assert "its lengths have no scale" in metrics["evaluation"]["notes"][0]
     json_of(capsys, "eval", out, tmp_path / "other.txt")
-    assert caplog.text.count("is it the reference of this recording?") == 2
+    assert caplog.text.count("scaled by 3") == 2
 
 
 def test_log_replays_the_motion_of_its_run(

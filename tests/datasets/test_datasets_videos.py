@@ -308,3 +308,64 @@ def test_times_of_videos_may_be_named_as_those_of_folders(
     (folder / "times.txt").unlink()
     (folder / name).write_text("frame,timestamp [ns]\n" + "".join(rows))
     np.testing.assert_array_equal(open_dataset(folder).recording.frame_times_ns, expected)
+
+
+@pytest.mark.parametrize("names", ["{}.txt", "{}_timestamps.csv", "times-{}.txt"])
+def test_a_list_for_each_of_two_videos_pairs_their_frames(
+    names: str, videos: Path, tmp_path: Path
+) -> None:
+    folder = copy_of(videos, tmp_path / "v")
+    usual = open_dataset(folder)
+    times = usual.recording.frame_times_ns.tolist()
+    (folder / "times.txt").unlink()
+    frames = frames_of(usual)
+    lost = [k for k in range(len(times)) if k not in (2, 3)]
+    rights = [frame.right for frame in frames_of(usual)]
+    assert all(right is not None for right in rights)
+    write_video(folder / "right.avi", [rights[k] for k in lost])  # type: ignore[misc]
+    for side, kept in (("left", range(len(times))), ("right", lost)):
+        text = "frame,timestamp [ns]\n" + "".join(f"{n},{times[k]}\n" for n, k in enumerate(kept))
+        (folder / names.format(side)).write_text(text)
+    dataset = open_dataset(folder)
+    assert dataset.recording.frame_times_ns.tolist() == [times[k] for k in lost]
+    assert any("2 images of left.avi" in note for note in dataset.recording.notes)
+    assert not any("not used" in note for note in dataset.recording.notes)
+    for frame, k in zip(frames_of(dataset), lost, strict=True):
+        np.testing.assert_array_equal(frame.left, frames[k].left)
+        np.testing.assert_array_equal(frame.right, frames[k].right)
+
+
+def test_a_list_of_all_frames_of_the_longer_video_serves(videos: Path, tmp_path: Path) -> None:
+    folder = copy_of(videos, tmp_path / "v")
+    usual = open_dataset(folder)
+    rights = [frame.right for frame in frames_of(usual)]
+    write_video(folder / "right.avi", rights[:-3])  # type: ignore[arg-type]
+    dataset = open_dataset(folder)
+    expected = usual.recording.frame_times_ns[:-3]
+    np.testing.assert_array_equal(dataset.recording.frame_times_ns, expected)
+
+
+def test_a_single_video_is_not_decoded_to_its_middle(
+    videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = copy_of(videos, tmp_path / "v", "right.avi")
+    asked: list[int] = []
+
+    def note(count: int, load: Callable[[int], np.ndarray]) -> None:
+        asked.append(count)
+
+    monkeypatch.setattr("vio.datasets.videos.alternating_note", note)
+    monkeypatch.setattr("vio.datasets.videos._LOOKED_AT", 5)
+    with pytest.raises(DataError, match="is the only video"):
+        open_dataset(folder)
+    assert asked == [5]
+
+
+def test_a_single_video_of_twice_the_height_may_hold_both_cameras(
+    videos: Path, tmp_path: Path
+) -> None:
+    folder = copy_of(videos, tmp_path / "v", "right.avi")
+    stacked = [np.vstack([frame.left] * 2) for frame in frames_of(open_dataset(videos), 0, 4)]
+    write_video(folder / "left.avi", stacked)
+    with pytest.raises(DataError, match="one above the other"):
+        open_dataset(folder)

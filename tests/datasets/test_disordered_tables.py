@@ -194,3 +194,34 @@ def test_a_counter_that_began_again_is_doubted(first: int, doubted: bool, tmp_pa
     doubts = [note for note in open_dataset(folder).recording.notes if "doubtful" in note]
     assert len(doubts) == doubted
     assert all("img97.png is the first image" in doubt for doubt in doubts)
+
+
+def _sharing(share: float, jitter_ns: int, run: int = 1) -> list[str]:
+    """Lines of which some have the time of the one above: `run` each, a share of all."""
+    rng = np.random.default_rng(1)
+    rows = [line.split(",") for line in _lines()]
+    for k, row in enumerate(rows):
+        row[0] = str(int(row[0]) + int(rng.integers(0, jitter_ns + 1)))
+        if k and k % round(1 / share) < run:
+            row[0] = rows[k - 1][0]
+    return [",".join(row) for row in rows]
+
+
+def test_other_readings_at_the_time_of_the_line_above_are_left_out(tmp_path: Path) -> None:
+    """As drivers stamp gyro and accelerometer that they join."""
+    lines = _sharing(0.2, 1000)
+    times, _, notes = _read(tmp_path, lines)
+    assert times == sorted({int(line.split(",")[0]) for line in lines})
+    assert any("79 of 400 lines have the time of the one above" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [_sharing(0.2, 0), _sharing(0.5, 1000), _sharing(0.2, 1000, run=2)],
+    ids=["rounded", "every second one", "in a row"],
+)
+def test_times_that_may_be_rounded_or_of_a_clock_that_stood_are_refused(
+    lines: list[str], tmp_path: Path
+) -> None:
+    with pytest.raises(DataError, match="the clock repeats"):
+        _read(tmp_path, lines)

@@ -269,6 +269,30 @@ def test_a_lever_arm_in_millimetres_is_doubted(tmp_path: Path) -> None:
     assert f"it is {arm_m:.4g} m" in doubt
 
 
+@pytest.mark.parametrize(
+    ("baseline_m", "distance_m", "is_doubted"),
+    [
+        (0.11, 6.9, True),  # 69 mm in centimetres
+        (0.05, 2.9, False),
+        (0.12, 4.7, False),
+        (0.12, 4.9, True),
+        (0.54, 9.9, False),
+    ],
+)
+def test_a_lever_arm_in_centimetres_is_doubted_beside_a_short_baseline(
+    baseline_m: float, distance_m: float, is_doubted: bool, tmp_path: Path
+) -> None:
+    T = np.eye(4)
+    T[0, 3] = distance_m
+    rig = vio.Rig.rectified(300.0, 300.0, 159.5, 119.5, baseline_m, 320, 240, T_cam0_imu=T)
+    file = tmp_path / "camchain-imucam.yaml"
+    file.write_text(kalibr_text(rig))
+    doubts = [note for note in vio.load_rig(file).notes if "doubtful" in note]
+    assert bool(doubts) is is_doubted
+    if is_doubted:
+        assert f"if it is the centimetre, it is {distance_m / 100:.4g} m" in doubts[0]
+
+
 def test_a_second_calibration_is_named(tmp_path: Path) -> None:
     folder = make_plain(tmp_path)
     chain = (folder / "camchain-imucam.yaml").read_text()
@@ -408,6 +432,9 @@ def test_a_doubt_about_stretched_images_has_a_factor_for_each_axis(tmp_path: Pat
     file.write_text(f"P0: {K.format(0)}\nP1: {K.format(-70)}\n")
     (note,) = vio.load_rig(file, image_size=(1024, 648)).notes
     assert "divide its focal lengths and principal points by 1.25 along x and 1.11 along y" in note
+    assert "if it is that of rectified images and these are raw ones" in note
+    (note,) = vio.load_rig(file, image_size=(1024, 576)).notes
+    assert "raw ones" not in note  # one factor
 
 
 def _with_counters(path: Path) -> None:

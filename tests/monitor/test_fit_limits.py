@@ -162,20 +162,34 @@ FORCE: dict[str, tuple[Says, float, float]] = {
 
 
 def _gyro_says(
-    unexplained: float = 0.0, excess: float = 0.0, *, clipped: bool = False, count: int = 100
+    unexplained: float = 0.0,
+    excess: float = 0.0,
+    *,
+    clipped: bool = False,
+    count: int = 100,
+    last: bool = False,
+    scale: float = 3.0,
+    words: str | None = None,
 ) -> list[str]:
+    """The faults that are found; with `words`, of the messages that have them alone."""
     fit: Any = SimpleNamespace(
         unexplained=unexplained,
         tolerance=0.2,
         excess=lambda C, scale: excess,
         fits=lambda C: True,
-        scale=lambda C: 3.0,
+        scale=lambda C: scale,
         count=count,
         S_cc=I3,
         S_gg=I3,
     )
-    evidence = _evidence(gyro_fit=fit, clipped=clipped)
-    return [f.fault for f in gyro.judge_gyro(evidence, 1.0)]
+    evidence = _evidence(gyro_fit=fit, clipped=clipped, last=last)
+    return [f.fault for f in gyro.judge_gyro(evidence, 1.0) if words is None or words in f.message]
+
+
+def _of_times(scale: float) -> bool:
+    """Whether a factor on the gyro may be that of all times."""
+    words = "are 0.1 times the true ones"
+    return _gyro_says(excess=1.0, scale=scale, words=words) == ["gyro units"]
 
 
 def _agrees(unexplained: float) -> bool:
@@ -221,6 +235,12 @@ def _jitters(
 
 GYRO: dict[str, tuple[Says, float, float]] = {
     "disagrees": (lambda x: _gyro_says(x) == ["gyro disagrees"], 0.45, 0.55),
+    # 0.3 + 0.775**2 is 0.9
+    "as none": (lambda x: _gyro_says(0.3, x) == ["gyro disagrees"], 0.73, 0.82),
+    "as none: short": (lambda n: _gyro_says(0.3, 1.0, count=int(n), last=True) != [], 19, 20),
+    "as none: end": (lambda last: _gyro_says(0.3, 1.0, count=20, last=last > 0.5) != [], 0, 1),
+    "times: little": (lambda x: _of_times(x), 9.4, 9.7),
+    "times: much": (lambda x: not _of_times(x), 10.3, 10.6),
     "clipped": (lambda x: _gyro_says(excess=x, clipped=True) == [], 0.55, 0.45),
     "brief": (lambda x: _gyro_says(excess=x, count=30) == [], 0.77, 0.63),
     "agrees": (lambda x: not _agrees(x), 0.17, 0.23),

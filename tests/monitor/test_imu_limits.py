@@ -39,6 +39,14 @@ def _missing(frames: int, seconds: float) -> bool:
     return bool(coverage.so_far(None, 0.0))
 
 
+def _silence_is_reported(seconds: float, step_s: float) -> bool:
+    """Whether a clock is doubted so long after samples of a step, none of which any frame had."""
+    coverage = SampleCoverage()
+    for k in range(20):
+        coverage.frame(round(1e9 * (seconds - 0.05 * (19 - k))), None)
+    return bool(coverage.so_far((-round(1e9 * step_s), 0), 1e9 * step_s))
+
+
 def _is_covered(late_s: float) -> bool:
     """Whether frames have samples that end so long before each."""
     coverage = SampleCoverage()
@@ -53,6 +61,8 @@ CLOCKS: dict[str, tuple[Says, float, float]] = {
     "missing: frames": (lambda n: _missing(int(n), 2.0), 9, 10),
     "missing: seconds": (lambda s: _missing(40, s), 0.34, 0.46),
     "late": (lambda s: not _is_covered(s), 0.085, 0.115),
+    "silent after few": (lambda s: _silence_is_reported(s, 0.0), 1.4, 1.6),
+    "silent after slow ones": (lambda s: _silence_is_reported(s, 1.0), 1.9, 2.1),
 }
 
 
@@ -63,9 +73,9 @@ def _record(times_s: FloatArray, values: FloatArray) -> ImuRecord:
     return ImuRecord((1e9 * times_s).astype(np.int64), values[:, :3].copy(), values[:, 3:].copy())
 
 
-def _is_slow(rate_hz: float) -> bool:
+def _is_slow(rate_hz: float, words: str = "too few to integrate") -> bool:
     record = _record(np.arange(200) / rate_hz, NOISE[:200])
-    return any("too few to integrate" in note for note in sampling_notes(record, "imu"))
+    return any(words in note for note in sampling_notes(record, "imu"))
 
 
 def _repeats(rows: int, often: int = 4, others: float = 0.0) -> bool:
@@ -89,6 +99,7 @@ def _bursts(count: int = 40, within: float = 0.01, more: float = 0.0) -> bool:
 
 RATES: dict[str, tuple[Says, float, float]] = {
     "slow": (lambda hz: not _is_slow(hz), 43.0, 57.0),
+    "slow: unit": (lambda hz: not _is_slow(hz, "in another unit"), 1.8, 2.2),
     "repeated: rows": (lambda n: _repeats(int(n)), 21, 22),
     "repeated: times": (lambda n: _repeats(60, int(n)), 2, 3),
     "repeated: alike": (lambda x: not _repeats(400, others=x), 0.05, 0.35),

@@ -228,6 +228,43 @@ def test_poor_sensor_gives_no_finding() -> None:
     assert _watch(it, samples=poor) == []
 
 
+@pytest.mark.parametrize(("name", "seed"), [("room", 0), ("slow", 2), ("still", 4), ("car", 5)])
+def test_gyro_and_accelerometer_in_each_others_place_are_named(name: str, seed: int) -> None:
+    it = _recording(name, seed)
+    exchanged = [replace(s, gyro=s.accel, accel=s.gyro) for s in it.samples]
+    (found,) = _watch(it, samples=exchanged)
+    assert "gyro and accelerometer are exchanged" in found.message
+    assert found.is_disabling
+
+
+def test_a_gyro_in_degrees_beside_gravity_is_not_exchanged() -> None:
+    it = _recording("room", 0)
+    steady = _gyro(it, lambda w: w + np.array([9.8, 0.0, 0.0]))  # deg/s, of a turntable
+    assert not any("exchanged" in found.message for found in _watch(it, samples=steady))
+
+
+@pytest.mark.parametrize("count", [30, 45, 60])
+def test_a_gyro_that_rests_while_the_camera_turns_is_named_in_a_short_recording(count: int) -> None:
+    it = _recording("room", 1)
+    frames = it.frames[120 : 120 + count]
+    noise = np.random.default_rng(0)
+    resting = _gyro(it, lambda w: noise.normal([0.01, -0.02, 0.01], 0.005))
+    assert "gyro disagrees" in _faults(_watch(it, frames=frames, samples=resting))
+
+
+@pytest.mark.parametrize("seconds", [6.5, 9.5, 12.5])
+@pytest.mark.parametrize(("name", "seed"), [("room", 0), ("room", 1), ("slow", 2)])
+def test_readings_of_another_time_are_found_wrong(name: str, seed: int, seconds: float) -> None:
+    """Some offset and some linear map explain half of them by chance, and the given axes nothing."""
+    it = _recording(name, seed)
+    later = [*it.samples[round(200 * seconds) :], *it.samples[: round(200 * seconds)]]
+    samples = [
+        replace(own, gyro=other.gyro, accel=other.accel)
+        for own, other in zip(it.samples, later, strict=True)
+    ]
+    assert "gyro disagrees" in _faults(_watch(it, samples=samples))
+
+
 # Units, signs, axes
 
 _CYCLE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])

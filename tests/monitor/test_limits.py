@@ -15,7 +15,7 @@ from vio.monitor.contradiction import ImuContradiction
 from vio.monitor.gyro_fit import GyroFit
 from vio.monitor.health import RefusalReport, RunHealth
 from vio.monitor.integrity import IntegrityMonitor
-from vio.monitor.samples import Samples, judge_size
+from vio.monitor.samples import Samples, judge_exchange, judge_size
 from vio.records import (
     Estimate,
     ImuSample,
@@ -264,6 +264,18 @@ def _averaged(period_s: float) -> bool:
     return size.finding is None or "in g" not in size.finding.explanation
 
 
+def _exchanged(gravity: float = 1.0, varies: float = 0.0, accel: float = 0.0) -> bool:
+    """Whether readings are called those of the other sensor: the gyro's are so many times gravity,
+    and vary by a share (robust deviation), the accelerometer's are a share of gravity.
+    """
+    times = (1e9 * 0.2 * np.arange(202)).astype(np.int64)
+    values = np.zeros((202, 6))
+    signs = np.repeat([-1.0, 0.0, 1.0], [67, 68, 67]) / 1.4826
+    values[:, 1] = 9.80665 * gravity * (1.0 + varies * signs)
+    values[:, 3] = 9.80665 * accel
+    return judge_exchange(times, values) is not None
+
+
 READINGS: dict[str, tuple[Says, float, float]] = {
     "gap": (_missing, 0.09, 0.11),
     "gap: usual steps": (lambda x: _missing(x, 0.02), 0.14, 0.18),
@@ -272,6 +284,10 @@ READINGS: dict[str, tuple[Says, float, float]] = {
     "clipped: chance": (lambda n: _clipped(int(n), share_held=0.5), 20, 35),
     "size: time": (_size_kind, 0.9, 1.1),
     "size: averaged": (_averaged, 0.2, 0.33),
+    "exchanged: little": (lambda x: _exchanged(x), 0.7, 0.8),
+    "exchanged: much": (lambda x: not _exchanged(x), 1.2, 1.3),
+    "exchanged: steady": (lambda x: not _exchanged(varies=x), 0.27, 0.33),
+    "exchanged: gravity": (lambda x: not _exchanged(accel=x), 0.45, 0.55),
 }
 
 

@@ -63,6 +63,16 @@ def test_images_that_leave_the_imu_at_once_are_named() -> None:
     assert _codes([*USUAL, 60], 12.0) == []
 
 
+def test_frames_in_a_row_are_one_shock() -> None:
+    check = ViewChange()
+    named = []
+    for k in range(40):
+        ratio = 20.0 if 10 <= k < 15 or k in (17, 30) else 1.0
+        if check.frame(_frame(k, 10 * k), ratio, measured=True, imu=True):
+            named.append(k)
+    assert named == [10, 30]
+
+
 def test_a_rig_whose_frames_never_share_much_has_no_other_view() -> None:
     assert _codes([51 * k for k in range(6)] + [1000], None) == []  # 49 of 100
     assert _codes([50 * k for k in range(6)] + [1000], None) == ["view-changed"]

@@ -4,6 +4,7 @@ merely wrong.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,6 +74,51 @@ def test_inverse_poses_are_named() -> None:
     assert len([note for note in notes if "poses of one of the two are inverted" in note]) == 1
     alone = replace(inverse, orientations="none")
     assert not [note for note in evaluate(alone, _trajectory()).notes if "inverted" in note]
+
+
+def _moved(trajectory: Trajectory, arm: FloatArray) -> Trajectory:
+    """The same motion of another point of the body, with other axes."""
+    T_body_point = se3_from_parts(so3_exp(np.array([0.0, 0.0, np.pi / 2])), arm)
+    return replace(trajectory, T_world_body=trajectory.T_world_body @ T_body_point)
+
+
+ARM = np.array([0.5, -0.3, 0.2])
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.002])
+def test_a_reference_of_another_point_of_the_body_is_named(scale: float) -> None:
+    notes = evaluate(_odometry(scale, 1e-5, 0.002), _moved(_trajectory(), ARM)).notes
+    (note,) = [note for note in notes if "another point of the body" in note]
+    length, *found = [float(text) for text in re.findall(r"[-+]?\d+\.\d+", note)[:4]]
+    assert length == pytest.approx(np.linalg.norm(ARM), abs=0.03)
+    np.testing.assert_allclose(found, ARM, atol=0.03)
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.0, 1.05])
+@pytest.mark.parametrize("turn_rad", [0.0, 1e-4, 1e-3])
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_an_estimate_that_drifts_is_no_other_point_of_the_body(
+    scale: float, turn_rad: float, noise: float
+) -> None:
+    notes = evaluate(_odometry(scale, turn_rad, noise), _trajectory()).notes
+    assert not [note for note in notes if "another point of the body" in note]
+
+
+def test_an_estimate_without_a_scale_is_called_so() -> None:
+    truth = _trajectory()
+    poses = _odometry(1.0, 1e-5, 0.002).T_world_body.copy()
+    poses[:, :3, 3] *= 0.37
+    (note,) = evaluate(replace(truth, T_world_body=poses), truth).notes
+    assert "scaled by 2.7" in note
+    assert "its lengths have no scale" in note
+    other = truth.T_world_body.copy()
+    other[:, :3, 3] = 3 * _positions(0.05 * np.arange(COUNT)[::-1] ** 2 / COUNT)
+    (note,) = [
+        note
+        for note in evaluate(truth, replace(truth, T_world_body=other)).notes
+        if "over the same poses" in note
+    ]
+    assert note.endswith("is it the reference of this recording?")
 
 
 def test_placeholders_amid_an_estimate_are_named() -> None:

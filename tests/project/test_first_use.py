@@ -45,6 +45,20 @@ def test_work_without_a_terminal_says_that_it_begins_and_how_far_it_is(
     ]
 
 
+def test_the_clock_of_a_bar_goes_on_while_a_part_of_the_work_is_silent(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr("sys.stderr", terminal)
+    monkeypatch.setattr(waiting, "_LINES", waiting._LineRules(0.1, 0.0))
+    with caplog.at_level(NOTE), SilenceBroken("check"), ProgressBar("check x") as bar:
+        bar.begin("check x: match images")
+        drawn = terminal.getvalue().count("match images")
+        wait_for(lambda: terminal.getvalue().count("match images") > drawn + 2)
+    assert not caplog.messages
+
+
 def test_short_work_is_silent_where_it_is_not_announced(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(NOTE), ProgressBar("convert x", 3) as bar:
         bar.update(3)

@@ -106,8 +106,11 @@ class ProgressBar(contextlib.AbstractContextManager["ProgressBar"]):
             log.log(NOTE, "%s", self._line())
 
     def _line(self) -> str | None:
-        """Return how far the work is; None: the bar shows it."""
+        """Return how far the work is; None: the bar shows it, whose clock goes on though no step is
+        done.
+        """
         if self._bar is not None:
+            self._bar.refresh()
             return None
         if not self._done and self._total is None:
             return self._label

@@ -199,18 +199,25 @@ class ImageSize:
             raise UnreadableImageError(
                 f"{path} is {image.shape[1]} x {image.shape[0]} pixels but {self.stated_by} is for "
                 f"{self.width} x "
-                f"{self.height}{self._hint(image)}; give images of one size, and the calibration of "
-                "these images"
+                f"{self.height}"
+                f"{stacked_hint((image.shape[1], image.shape[0]), (self.width, self.height))}; give "
+                "images of one size, and the calibration of these images"
             )
 
-    def _hint(self, image: Image) -> str:
-        """Return what an image (H, W) of twice the height may be."""
-        if image.shape[:2] != (2 * self.height, self.width):
-            return ""
-        return (
-            ", of twice the height, as those that hold both cameras' images one above the other or "
-            "in alternate rows: write each camera's images into a folder of its own"
-        )
+
+def stacked_hint(size: tuple[int, int], stated: tuple[int, int]) -> str:
+    """Return what images of twice the stated height may be; nothing where they have another size.
+
+    Args:
+        size: width and height of the images, pixels.
+        stated: those that the calibration states.
+    """
+    if size != (stated[0], 2 * stated[1]):
+        return ""
+    return (
+        ", of twice the height, as those that hold both cameras' images one above the other or "
+        "in alternate rows: write each camera's images into a folder or a video of its own"
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,13 @@ from vio.datasets.companions import (
 )
 from vio.datasets.euroc import is_euroc_folder, read_euroc
 from vio.datasets.image_files import FilePairs, ImageFiles
-from vio.datasets.image_pairs import ImageDataset, ImagePairs, measured_images, pair_images
+from vio.datasets.image_pairs import (
+    ImageDataset,
+    ImagePairs,
+    measured_images,
+    pair_images,
+    stacked_hint,
+)
 from vio.datasets.image_times import (
     counted_apart,
     frame_times,
@@ -439,6 +445,23 @@ def read_mono(path: Path, settings: DatasetSettings) -> ImageDataset:
     return _read("mono", layout, images, settings)
 
 
+def _check_not_stacked(first: Path, size: tuple[int, int], file: Path, rig: Rig) -> None:
+    """Raise DataError where the images of one camera seem to hold those of two, one above the other.
+
+    Args:
+        first: one of the images.
+        size: their width and height, pixels.
+        file: the calibration.
+        rig: what it states.
+    """
+    stated = (rig.cam0.width, rig.cam0.height)
+    if hint := stacked_hint(size, stated):
+        raise DataError(
+            f"{first} is {size[0]} x {size[1]} pixels but {file} is for {stated[0]} x "
+            f"{stated[1]}{hint}"
+        )
+
+
 def _empty_partner_note(layout: Layout) -> tuple[str, ...]:
     """State that the folder of the right images is there, without any."""
     for left, right in _PAIRS:
@@ -489,6 +512,8 @@ def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings)
     used = list[Path]()
     is_tum = images.listed_ns is not None
     file, rig = _file_and_rig(kind, layout, size, settings, is_tum=is_tum)
+    if kind == "mono":
+        _check_not_stacked(images.pairs[0][0], size, file, rig)
     depth_factor = 1.0
     if images.depths is not None:
         depth_factor, factor_notes = _depth_factor(rig, settings, layout.root)

@@ -55,6 +55,10 @@ _INDEXED_AXIS = re.compile(r"[\[(]([012xyz])[\])]")
 _IMU_COLUMNS = 7
 _SENSOR_COLUMNS = 4  # of a gyro or an accelerometer alone
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
+# Of times that two lines share: at most so many, and the unit in which all steps are whole numbers is
+# at most so much of the usual one, or the times were rounded
+_MAX_SHARED = 0.35
+_FINE = 0.1
 _MAX_LATE = 0.05  # share of lines that may have been written late
 _OWN_PLACE = 0.5  # of the usual interval that is free on both sides of such a line
 _OTHER_UNITS = {"rad/s": "deg/s or mdps", "m/s^2": "g or mg"}  # for messages
@@ -279,8 +283,31 @@ def in_order(
     if late.any() and _fits(times, late):
         kept = kept[np.argsort(times, kind="stable")]
         notes.append(f"{table.path}: {int(late.sum())} lines were written late and are sorted")
+    shared = _shared(times_ns[kept])
+    if shared.any():
+        notes.append(
+            f"{table.path}: {int(shared.sum())} of {len(kept)} lines have the time of the one above, "
+            "and other readings, as a driver writes that stamps two samples at once; they are left "
+            "out: record the sensor's own stamps"
+        )
+        kept = kept[~shared]
     table = _rows(table, kept)
     return table, check_increasing(times_ns[kept], table.where)
+
+
+def _shared(times_ns: IntArray) -> BoolArray:
+    """Return which times (N,) are those of the one before, where single ones are, of stamps that are
+    finer than their steps; none where they may be rounded, or a clock stood still.
+    """
+    shared = np.zeros(len(times_ns), dtype=np.bool_)
+    steps = np.diff(times_ns)
+    shared[1:] = steps == 0
+    alone = not (shared[1:] & shared[:-1]).any() and shared.sum() <= _MAX_SHARED * len(shared)
+    apart = steps[steps > 0]
+    if not alone or (steps < 0).any() or not len(apart):
+        return np.zeros_like(shared)
+    is_fine = np.gcd.reduce(apart) <= _FINE * np.median(apart)
+    return shared if is_fine else np.zeros_like(shared)
 
 
 def _fits(times_ns: IntArray, late: BoolArray) -> bool:

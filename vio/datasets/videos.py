@@ -4,7 +4,8 @@ in a plain folder, what else is beside them.
 Frame k of the one file belongs to frame k of the other. One file alone is taken to be side by side
 where the calibration is that of a pair whose images have half of its width. Frames are decoded in
 order, from the first on, because seeking in compressed video is not exact. Times come from
-`times.txt`, else from the frame rate that the files state. Where the presentation times of their
+`times.txt`, else from a list for each of two videos (`left.txt`, `right_timestamps.csv`), by which
+frames are paired, else from the frame rate that the files state. Where the presentation times of their
 frames do not follow that rate (phones, recorders that drop frames), these count, and frames belong
 together that have one time.
 """
@@ -12,6 +13,7 @@ together that have one time.
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,9 +24,9 @@ import numpy as np
 from vio.cameras.rig import Rig
 from vio.datasets.alternation import alternating_note
 from vio.datasets.companions import ReadImages, find_calibration_of, read_companions
-from vio.datasets.frame_times import nearest
-from vio.datasets.image_pairs import ImageRecording, half_of
-from vio.datasets.image_times import TIME_LISTS, times_of
+from vio.datasets.frame_times import nearest, paired
+from vio.datasets.image_pairs import ImageRecording, half_of, stacked_hint
+from vio.datasets.image_times import TIME_LISTS, time_lines, times_of
 from vio.datasets.images import UnreadableImageError, prefetch
 from vio.datasets.reader import Reader
 from vio.datasets.rigs import load_rig
@@ -42,7 +44,11 @@ _NAMES = (
     ("image_0", "image_1"),
     ("video_0", "video_1"),
 )
+# of the name of a list, what is no video's: `left_timestamps.csv`, `timestamps-left.txt`
+_LIST_WORDS = re.compile(r"time[-_ ]?stamps?|times?|stamps?|frames?|[-_. ]", re.IGNORECASE)
+_LIST_SUFFIXES = (".txt", ".csv")
 _RATES = (1.0, 1000.0)  # frames per second that a file can plausibly state
+_LOOKED_AT = 48  # frames of a single video that may alternate between two cameras
 
 
 class _TimeRules(NamedTuple):
@@ -99,8 +105,10 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
         )
     left = _facts(files[0])
     right = left if files[1] == files[0] else _facts(files[1])
-    uneven = left.times_ns is not None or right.times_ns is not None
-    if not uneven and abs(left.rate_hz - right.rate_hz) > 1e-3 * left.rate_hz:
+    one = files[0] == files[1]
+    own = None if one else _own_lists(path, files)
+    timed = own is not None or left.times_ns is not None or right.times_ns is not None
+    if not timed and abs(left.rate_hz - right.rate_hz) > 1e-3 * left.rate_hz:
         raise DataError(
             f"{files[0]} has {left.rate_hz:g} and {files[1].name} {right.rate_hz:g} frames per "
             "second; record both "
@@ -108,7 +116,6 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
         )
     layout = Layout(path, path, *files)
     file = settings.calibration or find_calibration_of(layout)
-    one = files[0] == files[1]
     if one:
         size = (left.width // 2, left.height)
     else:
@@ -116,10 +123,11 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     rig = load_rig(file, image_size=size, cameras=2)
     if one:
         _check_side_by_side(rig, left, files[0], file)
-    times_ns, times_file, rows, notes = _times(path, files, (left, right))
+    times_ns, times_file, rows, notes = _times(path, files, (left, right), own)
     if one:
         notes.append(f"{files[0].name} holds the left and the right image side by side")
-    read = ReadImages("video", layout, (file, rig), (times_ns, times_file), notes, files)
+    used = files if own is None else (*files, own[1])
+    read = ReadImages("video", layout, (file, rig), (times_ns, times_file), notes, used)
     parts = read_companions(read, settings)
     return VideoDataset(*parts, files, rows, imu_noise=rig.imu_noise)
 
@@ -127,13 +135,25 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
 def _check_side_by_side(rig: Rig, video: _Facts, path: Path, calibration: Path) -> None:
     """Raise DataError where a calibration is not of half the width of a single video."""
     if (rig.cam0.width, rig.cam0.height) != (video.width // 2, video.height):
-        doubt = alternating_note(video.count, _loader(path))
+        # no frame in the middle: all before it would be decoded
+        doubt = alternating_note(min(video.count, _LOOKED_AT), _loader(path))
+        hint = stacked_hint((video.width, video.height), (rig.cam0.width, rig.cam0.height))
         raise DataError(
             f"{path} is the only video, of {video.width} x {video.height} pixels, and "
-            f"{calibration} is for images of {rig.cam0.width} x {rig.cam0.height}; side by side "
-            "they would have twice that width; give left.mp4 and right.mp4, or the calibration of "
-            f"these images{'' if doubt is None else f'; {doubt}'}"
+            f"{calibration} is for images of {rig.cam0.width} x {rig.cam0.height}{hint}; side by "
+            "side they would have twice that width; give left.mp4 and right.mp4, or the "
+            f"calibration of these images{'' if doubt is None else f'; {doubt}'}"
         )
+
+
+def _own_lists(path: Path, files: tuple[Path, Path]) -> tuple[Path, Path] | None:
+    """Return the list of times of each of two videos, named as it (`left.txt`,
+    `left_timestamps.csv`); None: there are not both.
+    """
+    lists = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _LIST_SUFFIXES]
+    named = {_LIST_WORDS.sub("", file.stem.lower()): file for file in lists}
+    left, right = (named.get(_LIST_WORDS.sub("", file.stem.lower())) for file in files)
+    return None if left is None or right is None or left == right else (left, right)
 
 
 def _loader(file: Path) -> Callable[[int], Image]:
@@ -204,10 +224,19 @@ def _is_even(times_ns: IntArray, rate_hz: float) -> bool:
 
 
 def _times(
-    path: Path, files: tuple[Path, Path], facts: tuple[_Facts, _Facts]
+    path: Path,
+    files: tuple[Path, Path],
+    facts: tuple[_Facts, _Facts],
+    own: tuple[Path, Path] | None,
 ) -> tuple[IntArray, Path | None, IntArray, list[str]]:
     """Return the times (F,) of the pairs, the file that states them, the frames (F, 2) of each pair
     in both files, and notes.
+
+    Args:
+        path: the folder.
+        files: both videos.
+        facts: what they state.
+        own: the list of times of each; None: there are not both.
     """
     left, right = facts
     count = min(left.count, right.count)
@@ -222,10 +251,14 @@ def _times(
     )
     lists = (path / name for name in TIME_LISTS)
     if (file := next((file for file in lists if file.is_file()), None)) is not None:
-        names = [(Path(f"{k}"), Path(f"{k}")) for k in range(count)]
         doubts = list[str]()
-        times_ns = times_of(file, tuple(names), doubts)
+        # a line for each frame of the longer one as well
+        listed = len(time_lines(file)[0])
+        frames = listed if listed in (left.count, right.count) else count
+        times_ns = _listed_times(file, frames, doubts)[:count]
         return times_ns, file, rows, doubts + shorter
+    if own is not None:
+        return _times_of_own_lists(path, files, facts, own)
     if left.times_ns is not None or right.times_ns is not None:
         return _uneven_times(files, facts)
     if left.rate_hz == 0.0:
@@ -235,6 +268,29 @@ def _times(
     note = f"no times.txt: frames are {1e3 / left.rate_hz:.4g} ms apart, as {files[0].name} states; real cameras jitter"
     times_ns = np.rint(np.arange(count) * (NS_PER_S / left.rate_hz)).astype(np.int64)
     return times_ns, None, rows, [note, *shorter]
+
+
+def _listed_times(file: Path, frames: int, doubts: list[str]) -> IntArray:
+    """Return the times (F,) of as many frames by a list; doubts about its unit are added."""
+    names = [(Path(f"{k}"), Path(f"{k}")) for k in range(frames)]
+    return times_of(file, tuple(names), doubts)
+
+
+def _times_of_own_lists(
+    path: Path,
+    files: tuple[Path, Path],
+    facts: tuple[_Facts, _Facts],
+    lists: tuple[Path, Path],
+) -> tuple[IntArray, Path | None, IntArray, list[str]]:
+    """Return what `_times` does, of videos each of which has its list of times; frames are paired
+    by them.
+    """
+    doubts = list[str]()
+    left_ns, right_ns = (
+        _listed_times(file, video.count, doubts) for file, video in zip(lists, facts, strict=True)
+    )
+    a, b, notes = paired(left_ns, right_ns, [file.name for file in files], path)
+    return left_ns[a], lists[0], np.column_stack([a, b]), doubts + notes
 
 
 def _uneven_times(

@@ -4,6 +4,7 @@ the other trajectory bears out.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from vio.evaluation.association import associate
 from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.evaluation.reference_axes import with_other_order
 from vio.geometry.lie import FloatArray, nearest_rotation
+from vio.numerics.kinds import Tolerance
 from vio.records import Trajectory
 
 
@@ -23,6 +25,7 @@ class _OrderRules(NamedTuple):
 
     large_deg: float = 5.0  # of a spread, below which no order is doubted
     better_ratio: float = 5.0  # by which the right order must explain the attitudes better
+    rounding_deg: Tolerance[float] = 1e-3  # of spreads that are one
 
 
 _ORDER = _OrderRules()
@@ -51,18 +54,22 @@ def settled_orders(
     if not assumed or "none" in (estimate.orientations, reference.orientations):
         return estimate, reference, ()
     as_read = _spread_deg(estimate, reference, max_time_difference_s)
-    if as_read is None or as_read < _ORDER.large_deg:
+    if as_read == math.inf or as_read < _ORDER.large_deg:
         return estimate, reference, ()
-    for name, exchanged in assumed.items():
-        pair = given | {name: exchanged}
-        spread = _spread_deg(pair["estimate"], pair["reference"], max_time_difference_s)
-        if spread is not None and _ORDER.better_ratio * spread < as_read:
-            return (
-                pair["estimate"],
-                pair["reference"],
-                (_exchange_note(name, exchanged, spread, as_read),),
-            )
-    return estimate, reference, ()
+    left = {
+        name: _spread_deg(**(given | {name: exchanged}), limit_s=max_time_difference_s)
+        for name, exchanged in assumed.items()
+    }
+    spread = min(left.values())
+    if _ORDER.better_ratio * spread >= as_read:
+        return estimate, reference, ()
+    # Where neither file states its order, the better explanation counts. Both read wrong agree as
+    # both read right do, in one world: TUM's form has w last, lines with commas have either.
+    alike = [name for name in left if left[name] <= max(spread, _ORDER.rounding_deg)]
+    name = min(alike, key=lambda name: given[name].orientations != "w first, assumed")
+    pair = given | {name: assumed[name]}
+    note = _exchange_note(name, assumed[name], left[name], as_read)
+    return pair["estimate"], pair["reference"], (note,)
 
 
 def _exchange_note(name: str, exchanged: Trajectory, spread: float, as_read: float) -> str:
@@ -85,10 +92,11 @@ def _exchanged(trajectory: Trajectory) -> Trajectory:
     return replace(trajectory, T_world_body=poses, orientations=other)  # type: ignore[arg-type]
 
 
-def _spread_deg(estimate: Trajectory, reference: Trajectory, limit_s: float) -> float | None:
+def _spread_deg(estimate: Trajectory, reference: Trajectory, limit_s: float) -> float:
     """Return by how much the attitudes differ (median) beside a constant rotation of the body.
 
-    None: the positions do not determine the rotation between the worlds, or no poses match.
+    Infinite where the positions do not determine the rotation between the worlds, or no poses
+    match.
     """
     try:
         _, rows, reference_rows = associate(estimate, reference, max_time_difference_s=limit_s)
@@ -96,9 +104,9 @@ def _spread_deg(estimate: Trajectory, reference: Trajectory, limit_s: float) -> 
         T_ref = reference.T_world_body[reference_rows]
         alignment = align_poses(T_est, T_ref, "se3")
     except EvaluationError:
-        return None
+        return math.inf
     if alignment.rotation_from != "positions":
-        return None
+        return math.inf
     R_ref_world = np.swapaxes(T_ref[:, :3, :3], 1, 2)
     R = R_ref_world @ alignment.R @ T_est[:, :3, :3]
     mean: FloatArray = nearest_rotation(R.sum(axis=0))

@@ -1,5 +1,6 @@
 """What makes the positions of a reference differ from an estimate of the same motion: a clock that
-is apart, axes that are left-handed, inverse poses, poses that are placeholders.
+is apart, axes that are left-handed, inverse poses, poses that are placeholders, another point of the
+body.
 """
 
 from __future__ import annotations
@@ -8,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray, se3_inverse
+from vio.evaluation.alignment import Alignment, align_poses
+from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, so3_hat
 from vio.numerics.kinds import Tolerance
 from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 
@@ -25,6 +27,8 @@ class _FaultRules(NamedTuple):
     steps: int = 200  # of the first search, on either side
     finer: int = 10  # steps on either side of the best one, twice
     min_jump_m: float = 0.01  # to the identity: below, a body may stand at its start
+    max_arm_m: float = 5.0  # of a reference's point from the body that is estimated
+    fits: Tolerance[int] = 10  # of a lever arm beside an alignment
 
 
 _FAULT = _FaultRules()
@@ -72,6 +76,81 @@ def position_fault(
                 "some programs write, and the other the body in the world; invert its poses"
             )
     return _clock_fault(estimate, reference)
+
+
+def lever_arm_note(T_est: FloatArray, T_ref: FloatArray) -> str | None:
+    """Return the note on a reference that describes another point of the body; None: the positions
+    agree, or no lever arm explains their distances.
+
+    It must explain them beside a scale as well, which bends a short path alike.
+
+    Args:
+        T_est: (M, 4, 4) poses that were paired, in the estimate's world.
+        T_ref: (M, 4, 4) the poses of the reference.
+    """
+    every = slice(None, None, -(-len(T_est) // _FAULT.max_poses))
+    T_est = T_est[every]
+    y = T_ref[every, :3, 3]
+    if len(y) < _FAULT.min_poses:
+        return None
+    path_m = float(np.linalg.norm(np.diff(y, axis=0), axis=1).sum())
+    arms = []
+    for scaled in (False, True):
+        start = align_poses(T_est, T_ref[every], "sim3" if scaled else "se3")
+        without_m, _ = _beside_arm(T_est, y, start, scaled=scaled, arm=False)
+        left_m, arm = _beside_arm(T_est, y, start, scaled=scaled, arm=True)
+        if not left_m < _FAULT.explained * without_m:
+            return None
+        arms.append((without_m, left_m, arm))
+    without_m, left_m, arm = arms[0]
+    length_m = float(np.linalg.norm(arm))
+    if not (without_m > _FAULT.min_share * path_m and without_m < length_m < _FAULT.max_arm_m):
+        return None
+    return (
+        f"the positions agree where the reference's are {length_m:.3g} m beside the estimate's, at "
+        f"{arm[0]:+.3f} {arm[1]:+.3f} {arm[2]:+.3f} m in its body (ATE {left_m:.3g} m, "
+        f"{without_m:.3g} m without): the reference seems to describe another point of the body, such "
+        "as a camera, a prism or an antenna; move its poses by it, or ATE and scale are those of the "
+        "distance"
+    )
+
+
+def _beside_arm(
+    T_est: FloatArray, y: FloatArray, start: Alignment, *, scaled: bool, arm: bool
+) -> tuple[float, FloatArray]:
+    """Return the root mean square distance, m, of `s R (p + R_est l) + t` from y, and l (3,).
+
+    Gauss-Newton on R, t, where wanted s and l; each step is linear.
+
+    Args:
+        T_est: (M, 4, 4).
+        y: (M, 3) positions of the reference.
+        start: alignment to begin from.
+        scaled: whether s is free.
+        arm: whether l is free; otherwise it is zero.
+    """
+    R = start.R
+    t = start.t
+    s = start.scale
+    lever: FloatArray = np.zeros(3)
+    for _ in range(_FAULT.fits):
+        turned = s * np.einsum("ij,mj->mi", R, T_est[:, :3, 3] + T_est[:, :3, :3] @ lever)
+        error = y - turned - t
+        columns = [-np.array([so3_hat(p) for p in turned]), np.tile(np.eye(3), (len(y), 1, 1))]
+        if scaled:
+            columns.append(turned[:, :, None])
+        if arm:
+            columns.append(s * R @ T_est[:, :3, :3])
+        J = np.concatenate(columns, axis=2).reshape(3 * len(y), -1)
+        step = np.linalg.lstsq(J, error.ravel(), rcond=None)[0]
+        R = so3_exp(step[:3]) @ R
+        t = t + step[3:6]
+        if scaled:
+            s *= float(np.exp(step[6]))
+        if arm:
+            lever = lever + step[-3:]
+    moved = s * np.einsum("ij,mj->mi", R, T_est[:, :3, 3] + T_est[:, :3, :3] @ lever) + t
+    return float(np.sqrt(np.mean(np.sum((y - moved) ** 2, axis=1)))), lever
 
 
 def _placeholders(estimate: Trajectory) -> str | None:

@@ -37,7 +37,7 @@ from vio.evaluation.errors_along_path import (
 )
 from vio.evaluation.quaternion_order import settled_orders
 from vio.evaluation.reference_axes import attitude_note
-from vio.evaluation.reference_faults import position_fault
+from vio.evaluation.reference_faults import lever_arm_note, position_fault
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.records import BodyFrame, IntArray, Trajectory
 
@@ -64,6 +64,8 @@ class _SuspicionRules:
     # a ratio of path lengths so near one of these is no chance; odometry without a scale has any
     # ratio
     unit_share: float = 0.1
+    # of the path of the reference: error after an alignment with scale, below which shapes agree
+    alike_share: float = 0.05
     path_min_m: float = 1.0  # paths below this may consist of noise
     matched_share: float = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
     # span of the matched poses, of the estimate; below, the figures are those of a part
@@ -217,6 +219,7 @@ def evaluate(
     T_aligned = aligned.T_world_body[rows]
     errors_deg = rotation_angle_deg(se3_inverse(T_ref) @ T_aligned)
     fault = position_fault(moved, reference, T_est, T_ref)
+    scale_free = _scale_free(T_est, T_ref)
     return Evaluation(
         align=align,
         association=association,
@@ -243,7 +246,7 @@ def evaluate(
         errors_deg=errors_deg,
         aligned=aligned,
         reference=take(reference, reference_rows),
-        scale_free=_scale_free(T_est, T_ref),
+        scale_free=scale_free,
         notes=(
             *_notes(
                 path_length_m(T_aligned[:, :3, 3]),
@@ -251,13 +254,17 @@ def evaluate(
                 rows,
                 moved,
                 reference,
+                scale_free,
             ),
             *(_row_note(moved, reference) if association == "frame" else ()),
             *order_notes,
             *(
                 ((fault,) if fault is not None else ())
                 or _positions_alone(estimate, reference)
-                or _attitude_notes(alignment, T_est, T_ref, T_aligned)
+                or (
+                    *_attitude_notes(alignment, T_est, T_ref, T_aligned),
+                    *_arm_notes(T_est, T_ref, scale_free),
+                )
             ),
         ),
     )
@@ -352,8 +359,9 @@ def _notes(
     rows: IntArray,
     estimate: Trajectory,
     reference: Trajectory,
+    scale_free: ScaleFree | None,
 ) -> tuple[str, ...]:
-    """Name signs that the reference belongs to another recording."""
+    """Name signs that the reference belongs to another recording, or has another scale."""
     notes = []
     short, long = sorted((estimate_m, reference_m))
     if long > _SUSPECT.path_min_m and long > _SUSPECT.path_ratio * short:
@@ -363,11 +371,16 @@ def _notes(
             if abs(long / max(short, 1e-12) / size - 1) < _SUSPECT.unit_share
         }
         which = "the reference" if reference_m > estimate_m else "the estimate"
-        what = (
-            f"{which} seems to be in {next(iter(units))}"
-            if units
-            else "is it the reference of this recording?"
-        )
+        if units:
+            what = f"{which} seems to be in {next(iter(units))}"
+        elif scale_free is not None and scale_free.ate_m < _SUSPECT.alike_share * reference_m:
+            what = (
+                f"scaled by {1 / scale_free.scale:.3g}, the estimate follows it to "
+                f"{metres_text(scale_free.ate_m)}: its lengths have no scale, as of one camera alone, "
+                "or a wrong one (baseline, unit of a calibration); --align sim3 leaves it out"
+            )
+        else:
+            what = "is it the reference of this recording?"
         notes.append(
             f"over the same poses the estimate travels {estimate_m:.1f} m and the reference "
             f"{reference_m:.1f} m; {what}"
@@ -416,6 +429,14 @@ def _positions_alone(estimate: Trajectory, reference: Trajectory) -> tuple[str, 
         for name, trajectory in (("estimate", estimate), ("reference", reference))
         if trajectory.orientations == "none"
     )
+
+
+def _arm_notes(
+    T_est: FloatArray, T_ref: FloatArray, scale_free: ScaleFree | None
+) -> tuple[str, ...]:
+    """Name a reference of M poses (M, 4, 4) that describes another point of the body."""
+    note = None if scale_free is None else lever_arm_note(T_est, T_ref)
+    return () if note is None else (note,)
 
 
 def _attitude_notes(

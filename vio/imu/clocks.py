@@ -22,6 +22,9 @@ class _ClockRules(NamedTuple):
 _CLOCKS = _ClockRules()
 _NO_IMU_FRAMES = 10  # missing samples are reported after so many frames and so much time
 _NO_IMU_S = 0.4
+# … and, where there were some before, after so many of their steps, and after so long
+_SLOW_STEPS = 2.0
+_SLOW_S = 1.5
 
 
 def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[InertialFinding, ...]:
@@ -78,6 +81,9 @@ class SampleCoverage:
             step_ns: their usual interval.
         """
         long = self._frames >= _NO_IMU_FRAMES and self._seconds >= _NO_IMU_S
+        if imu is not None and long:  # the next sample of a slow sensor may come
+            silent_ns = self._last_ns - imu[1]
+            long = silent_ns < 0 or silent_ns > max(_SLOW_STEPS * step_ns, _SLOW_S / S_PER_NS)
         if long and self._covered == 0:
             return [_no_overlap(self._span, imu, step_ns)]
         return []

@@ -18,6 +18,7 @@ class _RateRules(NamedTuple):
 
     # below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
     min_hz: float = 50.0
+    slowest_hz: float = 2.0  # below, the unit of its times is doubted
     min_rows: int = 20  # of equal readings, or bursts
     min_repeats: int = 3  # of a reading in a row, that a driver gives again and again
     alike_share: float = 0.8  # share of the rows that are about as long as the median
@@ -26,6 +27,7 @@ class _RateRules(NamedTuple):
 
 
 _RATES = _RateRules()
+_UNIT_HINT = "; if it has more, its times are in another unit: state it in the header"
 
 
 def sampling_notes(record: ImuRecord, where: str) -> tuple[str, ...]:
@@ -55,6 +57,7 @@ def sampling_notes(record: ImuRecord, where: str) -> tuple[str, ...]:
         notes.append(
             f"{where}: the IMU has {rate_hz:.3g} Hz, too few to integrate the motion between "
             f"images; record at least {_RATES.min_hz:g} Hz, or use --motion none"
+            f"{_UNIT_HINT if rate_hz < _RATES.slowest_hz else ''}"
         )
     return tuple(notes)
 

@@ -5,6 +5,7 @@ and for live use.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -93,6 +94,24 @@ def recorded_source(dataset: Dataset, config: Config) -> Source:
     return Source(
         recording.camera, recording.T_cam0_body, motion, recording, _features(dataset, config)
     )
+
+
+def refuse_other_types(config: Config, **given: object) -> None:
+    """Raise TypeError, with the call that makes the right one, where a program gives a path or a
+    dictionary in the place of what is read from it.
+
+    Args:
+        config: settings.
+        given: `rig` or `dataset`.
+    """
+    wanted = {"rig": "vio.load_rig(path)", "dataset": "vio.open_dataset(path)"}
+    for name, value in given.items():
+        if value is None or isinstance(value, (str, os.PathLike, dict)):
+            raise TypeError(f"{name}: give what {wanted[name]} returns, not {type(value).__name__}")
+    if not isinstance(config, Config):
+        raise TypeError(
+            f"config: give what vio.load_config(...) returns, not {type(config).__name__}"
+        )
 
 
 def live_source(

@@ -22,7 +22,14 @@ from vio.frontend.precomputed import PrecomputedFrontend
 from vio.frontend.settings import FrontendSettings
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, live_source
+from vio.live.build import (
+    CONFIGURED,
+    MapUse,
+    Parts,
+    build_processor,
+    live_source,
+    refuse_other_types,
+)
 from vio.live.event_inputs import EventInputs
 from vio.live.inputs import GivenFrame, Inputs, Shapes, checked_time, gray
 from vio.live.prediction import PosePredictor, PredictedPose
@@ -92,8 +99,10 @@ class Odometry(EventInputs["Estimate | None"]):
             ConfigError: the settings ask for what the rig does not have, or a map for a back end
                 without a window.
             DataError: the map cannot be used.
+            TypeError: a path is given in the place of the rig, or a dictionary for the settings.
         """
         self._config = Config() if config is None else config
+        refuse_other_types(self._config, rig=rig)
         self._rectifier: Rectifier | None = None
         self._rig: Rig | None = None  # as given; None: a rectified pair
         self._offset_ns = 0

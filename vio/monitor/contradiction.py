@@ -52,6 +52,11 @@ class ImuContradiction:
         self._quiet = 0  # frames in a row
         self._reported = False
 
+    @property
+    def stands(self) -> bool:
+        """Whether it was reported that they do, and not yet that they agree again."""
+        return self._reported
+
     def frame(self, index: int, innovation_ratio: float | None) -> list[Finding]:
         """Return what a frame shows.
 

@@ -24,12 +24,16 @@ class _ExcessRules(NamedTuple):
 
     # share of the rotation that the best linear map leaves unexplained
     disagreeing_share: float = 0.5
+    # likewise that the gyro as it is given leaves: one that never turns leaves 1
+    as_none: float = 0.9
+    min_intervals: int = 20  # that show the latter at the end of a short run
     # excess allowed where readings are clipped, which rotates and shortens the gyro's rates
     clipped_share: float = 0.5
     brief_share: float = 0.7  # likewise with fewer intervals than in the first evaluation
 
 
 _EXCESS = _ExcessRules()
+_POWER_OF_TEN = 0.02  # of the decimal logarithm of a factor that is one: 5 %
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +56,18 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     if evidence.turn is not None:
         C = so3_exp(evidence.turn.rotation) @ R
         return [turned_finding(evidence.turn, R), *_judge_scale(evidence, C)]
-    if gyro_fit.unexplained > _EXCESS.disagreeing_share:
-        return [] if brief else [_disagreement(gyro_fit)]
+    excess = gyro_fit.excess(R, 1.0)
+    if gyro_fit.unexplained > AGREES:
+        # the best map may be chance, as where clocks are far apart; what is given is not
+        misfit = gyro_fit.unexplained + excess**2
+        enough = not brief or (evidence.last and gyro_fit.count >= _EXCESS.min_intervals)
+        is_none = misfit > _EXCESS.as_none and enough
+        is_off = gyro_fit.unexplained > _EXCESS.disagreeing_share and not brief
+        return [_disagreement(gyro_fit)] if is_off or (is_none and not evidence.clipped) else []
     limit = max(
         gyro_fit.tolerance, _EXCESS.clipped_share * evidence.clipped, _EXCESS.brief_share * brief
     )
-    if gyro_fit.unexplained > AGREES or gyro_fit.excess(R, 1.0) < limit:
+    if excess < limit:
         return []
     if gyro_fit.fits(R):
         return _judge_scale(evidence, R)
@@ -157,6 +167,9 @@ def _judge_scale(evidence: Evidence, C: FloatArray) -> list[InertialFinding]:
         1e-3: "the gyro is in mrad/s: divide its readings by 1000",
     }
     odd = "the gyro's scale is wrong, or the camera's focal length is; rad/s are expected"
+    power = round(float(np.log10(scale)))
+    if power != 0 and abs(np.log10(scale) - power) < _POWER_OF_TEN:
+        odd += f"; or all times, of images and IMU, are {10.0**-power:g} times the true ones (their unit)"
     factor = next((factor for factor in named if abs(np.log(scale / factor)) < 0.15), None)
     return [
         InertialFinding("gyro units", seen, odd if factor is None else named[factor], factor=factor)

@@ -36,7 +36,7 @@ from vio.monitor.gyro_fit import (
 )
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.monitor.rotation_comparison import compare_rotations, judge_rotations
-from vio.monitor.samples import Samples, Size, is_long_enough, judge_size
+from vio.monitor.samples import Samples, Size, is_long_enough, judge_exchange, judge_size
 from vio.monitor.turned_imu import Turn, judge_turn
 from vio.records import (
     ROTATION_NOT_COMPARABLE,
@@ -170,6 +170,9 @@ class InertialCheck:
             return
         size = judge_size(times_ns, values[:, 3:])
         self._size_judged = True
+        if (exchanged := judge_exchange(times_ns, values)) is not None:
+            self._odd_size = exchanged.seen
+            return
         if size.finding is None:
             self._odd_size = ""
         else:
@@ -216,6 +219,8 @@ class InertialCheck:
             return []
         size = judge_size(times_ns, values[:, 3:])
         self.imu_at_fault = size.finding is not None
+        if (exchanged := judge_exchange(times_ns, values)) is not None:
+            return [exchanged]  # nothing else can be said of such readings
         if size.finding is None:
             self._odd_size = ""
         motion = self._motion.joined()

@@ -369,6 +369,8 @@ class RunMonitor:
         if self._seen is not None:
             ratio = report.innovation_ratio
             imu = self._refusals.imu
+            if self._contradiction is not None:
+                imu = imu and not self._contradiction.stands
             self._add(self._views.frame(self._seen, ratio, measured=measured, imu=imu))
             self._add(self._refusals.frame(self._seen, report, estimate))
         self._scale_lines += self._health.scale(index, estimate)

@@ -40,6 +40,10 @@ class _SizeRules(NamedTuple):
 
     averaged_s: float = 0.2  # readings are averaged over this time before their magnitude is judged
     min_s: float = 1.0
+    # of a gyro's readings that are an accelerometer's: from gravity, and their relative spread …
+    as_gravity: float = 0.25
+    steady: float = 0.3
+    no_gravity: float = 0.5  # … and the accelerometer's at most, of gravity
 
 
 _SIZE = _SizeRules()
@@ -243,9 +247,33 @@ def is_long_enough(times_ns: IntArray) -> bool:
 
 def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
     """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,)."""
-    t = np.asarray((times_ns - times_ns[0]) * S_PER_NS, dtype=np.float64)
     if not is_long_enough(times_ns):
         return Size(None, 1.0)
+    return _judge_median(*_usual_size(times_ns, accel))
+
+
+def judge_exchange(times_ns: IntArray, values: FloatArray) -> InertialFinding | None:
+    """Return the finding that readings (S, 6) have gravity where the gyro's are, and none of it where
+    the accelerometer's are; None: they do not.
+    """
+    if not is_long_enough(times_ns):
+        return None
+    accel, accel_spread = _usual_size(times_ns, values[:, 3:])
+    gyro, gyro_spread = _usual_size(times_ns, values[:, :3])
+    steady = abs(gyro / _GRAVITY - 1.0) < _SIZE.as_gravity and gyro_spread < _SIZE.steady
+    if not steady or accel > _SIZE.no_gravity * _GRAVITY:
+        return None
+    return InertialFinding(
+        "gravity removed",
+        f"the gyro's median magnitude is {gyro:.3g}, as steady as gravity, and the accelerometer's "
+        f"{accel:.3g} (spread {100 * accel_spread:.0f} %)",
+        "gyro and accelerometer are exchanged: the gyro's readings come first",
+    )
+
+
+def _usual_size(times_ns: IntArray, accel: FloatArray) -> tuple[float, float]:
+    """Return the median magnitude of mean readings (S, 3), and its relative spread."""
+    t = np.asarray((times_ns - times_ns[0]) * S_PER_NS, dtype=np.float64)
     integral = np.concatenate(
         [np.zeros((1, 3)), np.cumsum(np.diff(t)[:, None] * (accel[1:] + accel[:-1]) / 2, axis=0)]
     )
@@ -256,7 +284,7 @@ def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
     )
     size = np.linalg.norm(mean, axis=1)
     usual = median(size)
-    return _judge_median(usual, robust_sigma(size - usual) / max(usual, 1e-300))
+    return usual, robust_sigma(size - usual) / max(usual, 1e-300)
 
 
 def _judge_median(usual: float, spread: float) -> Size:

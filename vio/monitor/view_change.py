@@ -31,6 +31,8 @@ class _ViewRules(NamedTuple):
     # The same where most are found again, and a motion sensor says how the rig moved: as long as the
     # record of MH_01 lacks half a second, 28 and 39; of healthy recordings single frames come to 4.
     apart_sigmas: float = 12.0
+    # after one such frame, in which others belong to the same event
+    apart_frames: int = 10
 
 
 _VIEW = _ViewRules()
@@ -42,6 +44,8 @@ class ViewChange:
     def __init__(self) -> None:
         # the last frames that showed enough
         self._frames = deque[Observations](maxlen=_VIEW.frames + 2)
+        # frames since the last one that was apart from its prediction
+        self._since_apart = _VIEW.apart_frames
 
     def frame(
         self, seen: Observations, innovation_ratio: float | None, *, measured: bool, imu: bool
@@ -52,8 +56,10 @@ class ViewChange:
             seen: its features.
             innovation_ratio: as in `UpdateReport`; None: none of them was predicted.
             measured: whether a motion sensor carries the pose between frames.
-            imu: whether it is an IMU.
+            imu: whether it is an IMU, which has agreed so far: what contradicts the images for
+                longer is no shock.
         """
+        self._since_apart += 1
         if len(seen) < _VIEW.min_features:
             return []
         frames = self._frames
@@ -67,7 +73,9 @@ class ViewChange:
             return []
         if shares[-1] <= _VIEW.lost_share:
             return [_lost(seen.frame_index, len(frames[-2]), again[-1], measured=measured)]
-        if imu and _VIEW.apart_sigmas <= sigmas < np.inf:
+        is_apart = imu and _VIEW.apart_sigmas <= sigmas < np.inf
+        if is_apart and self._since_apart > _VIEW.apart_frames:
+            self._since_apart = 0
             return [_apart(seen.frame_index, sigmas)]
         return []
 

@@ -62,6 +62,12 @@ def convert_trajectory(
         CalibrationError: the body changes, and the calibration does not say how.
     """
     trajectory = read_trajectory(source)
+    if trajectory.orientations == "w first, assumed":  # of lines with commas, which have either
+        logger.warning(
+            "%s: does not state the order of its quaternions: they are read with w first; if w comes "
+            "last, name the columns in its header (qx,qy,qz,qw)",
+            source,
+        )
     if times is not None:
         trajectory = replace(trajectory, times_ns=_read_times(times, len(trajectory)))
     if trajectory.times_ns is None and form != "kitti":

@@ -25,7 +25,14 @@ from vio.frontend import one_opencv_thread
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import AS_READ, Repair, repaired
-from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, recorded_source
+from vio.live.build import (
+    CONFIGURED,
+    MapUse,
+    Parts,
+    build_processor,
+    recorded_source,
+    refuse_other_types,
+)
 from vio.live.processor import EventProcessor
 from vio.numerics.threads import one_blas_thread
 from vio.protocols import Dataset, Detector, Frontend, RectifyingDataset, Viewer
@@ -187,7 +194,9 @@ def run(
         VioError: the configuration, the data or the estimation is at fault; the message says which.
             With a folder, a fault after the first frame ends the run in order instead, and the
             result names it.
+        TypeError: a path is given in the place of the recording, or a dictionary for the settings.
     """
+    refuse_other_types(config, dataset=dataset)
     _check_range(dataset.recording, start, stop)
     with contextlib.closing(Viewers(() if viewer is None else (viewer,))) as shown:
         what = _Run(dataset, config, start, stop, keep_observations, shown, parts, map, control)

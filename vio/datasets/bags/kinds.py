@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 _ROS1 = b"#ROSBAG V"
 _SQLITE = b"SQLite format 3\0"
 _MCAP = b"\x89MCAP0\r\n"
 _SUFFIXES = (".bag", ".db3", ".mcap")
+# at the level of the whole bag, as topics with none are usual
+_NO_MESSAGE = re.compile(r"^  message_count: *0 *$", re.MULTILINE)
 
 
 def is_bag(path: Path) -> bool:
@@ -39,7 +42,18 @@ def _is_folder_of_ros2(path: Path) -> bool:
 
 
 def _is_ros2_folder(path: Path) -> bool:
+    """Tell whether a folder's `metadata.yaml` is that of its files.
+
+    A recorder that was killed leaves one that counts no message, and files that were renamed are
+    not in it: then they are opened without.
+    """
     metadata = path / "metadata.yaml"
-    return metadata.is_file() and "rosbag2_bagfile_information" in metadata.read_text(
-        encoding="utf-8", errors="replace"
-    )
+    if not metadata.is_file():
+        return False
+    text = metadata.read_text(encoding="utf-8", errors="replace")
+    if "rosbag2_bagfile_information" not in text:
+        return False
+    named = {name.strip(" -'\"").replace("\\", "/").rsplit("/", 1)[-1] for name in text.split("\n")}
+    files = [child for child in path.iterdir() if child.suffix in _SUFFIXES[1:]]
+    counted = _NO_MESSAGE.search(text) is None
+    return not files or (counted and any(child.name in named for child in files))

@@ -26,6 +26,11 @@ _OF_A_BAG = (
     "the bag is truncated or damaged ({why}); copy it again, or repair it with ROS's own tools "
     "(rosbag reindex, ros2 bag reindex, mcap recover)"
 )
+_ACTIVE = ".active"
+_NOT_CLOSED = (
+    "rosbag still writes it, or was killed before it closed it; end the recording, or repair it "
+    "with rosbag reindex, and rename it to .bag"
+)
 OF_A_MESSAGE = "a message is truncated or of another type ({why}); check its publisher"
 MISSING = "ROS bags need the package rosbags; install it with: pip install rosbags"
 
@@ -86,6 +91,8 @@ class Bag:
             DataError: a file is missing, truncated or damaged.
         """
         typestore = ros2_types()
+        if self.path.suffix == _ACTIVE:
+            raise DataError(f"{self.path}: {_NOT_CLOSED}")
         from rosbags.highlevel import AnyReader
 
         with named_damage(self.path):

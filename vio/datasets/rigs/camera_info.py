@@ -37,6 +37,7 @@ from vio.geometry.rectify import vertical_fault
 
 _MIN_BASELINE_M = 0.005  # no stereo camera has less
 _SAME_MATRIX = 1e-6  # relative, of the two P: beyond it each rectified image has its own
+_MAX_BASELINE_M = 1.0  # another reading makes no more than this
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +56,11 @@ class CameraInfo:
     # part of the sensor: x_offset, y_offset, width, height in its pixels; None: the whole
     roi: tuple[int, int, int, int] | None = None
 
+    @property
+    def states_size(self) -> bool:
+        """Whether the size of the images is stated: some drivers leave it at 0."""
+        return self.width > 0 and self.height > 0
+
     def of_images(self, size: tuple[int, int] | None) -> CameraInfo:
         """Return what describes the images themselves, which may be binned, or a part.
 
@@ -62,6 +68,8 @@ class CameraInfo:
             size: width and height of the images, where known; images of the whole sensor's size
                 are neither, whatever the message states.
         """
+        if not self.states_size and size is not None:
+            return replace(self, width=size[0], height=size[1], binning=(1, 1), roi=None)
         x, y, width, height = self.roi or (0, 0, self.width, self.height)
         along_u = max(self.binning[0], 1)
         along_v = max(self.binning[1], 1)
@@ -236,10 +244,13 @@ def rig_from_camera_infos(
         CalibrationError: a camera is not calibrated (K or P of zeros; of one camera, the one that
             applies), its lens is not read, or the two are no stereo pair.
     """
+    sized = all(info.states_size for info in infos)
     infos = [info.of_images(image_size) for info in infos]
     rig = _rig(infos, rectified=rectified)
     doubt = None if rig.cam1 is None else _metres_doubt(rig, infos[1])
-    return checked_rig(rig if doubt is None else rig.noting(doubt), infos[0].where)
+    if doubt is not None:
+        rig = rig.noting(doubt)
+    return checked_rig(rig, infos[0].where, size_stated=sized)
 
 
 def _rig(infos: Sequence[CameraInfo], *, rectified: bool) -> Rig:
@@ -260,24 +271,53 @@ def _rig(infos: Sequence[CameraInfo], *, rectified: bool) -> Rig:
             return Rig.rectified(
                 cam0.fu, cam0.fv, cam0.cu, cam0.cv, float(-shift[0]), cam0.width, cam0.height
             )
-    R0, R1 = (
-        checked_transform(np.column_stack([i.R, np.zeros(3)]), f"{i.where}, R")[:3, :3]
-        for i in infos
-    )
+    R0, R1 = (_rectification(info) for info in infos)
     cam0, cam1 = (_camera(info, rectified=False) for info in infos)
     return Rig(cam0, cam1, se3_from_parts(R1.T @ R0, R1.T @ shift))
 
 
+def _rectification(info: CameraInfo) -> FloatArray:
+    """Return R (3, 3) of a raw image; some drivers of rectified images leave it at zeros, and then
+    it is the identity.
+
+    Raises:
+        CalibrationError: R is no rotation, or is zero although the lens or P say that the images
+            are not rectified.
+    """
+    if info.R.any():
+        T = np.column_stack([info.R, np.zeros(3)])
+        return checked_transform(T, f"{info.where}, R")[:3, :3]
+    if any(info.D) or not np.allclose(info.K, info.P[:, :3], rtol=1e-6, atol=1e-6):
+        raise CalibrationError(
+            f"{info.where}: R is zero, so how the images are to be rectified is not stated (D and "
+            "the difference of K and P say that they are not); give the pair's calibration with "
+            "--calibration FILE"
+        )
+    return np.eye(3)
+
+
 def _metres_doubt(rig: Rig, right: CameraInfo) -> str | None:
-    """Return the doubt about a P[0, 3] that is the baseline itself; None: it may be a product."""
+    """Return the doubt about a P[0, 3] that makes less than any baseline, with the readings that
+    make one; None: it makes one, or none does.
+    """
     baseline = float(np.linalg.norm(rig.right[1][:3, 3]))
     stated = abs(float(right.P[0, 3]))
-    if baseline >= _MIN_BASELINE_M or not _MIN_BASELINE_M < stated < 1.0:
+    if baseline >= _MIN_BASELINE_M:
+        return None
+    readings = []
+    if _MIN_BASELINE_M < stated < _MAX_BASELINE_M:
+        readings.append(
+            f"if it is the baseline itself, {stated:g} m, multiply it by the focal length"
+        )
+    if _MIN_BASELINE_M < 1000 * baseline < _MAX_BASELINE_M:
+        readings.append(
+            f"if it was divided by 1000 once too often, the baseline is {1000 * baseline:.3g} m"
+        )
+    if not readings:
         return None
     return (
         f"{right.where}: doubtful: P[0, 3] is -focal * baseline, so that {right.P[0, 3]:g} makes a "
-        f"baseline of {baseline:.2g} m; if it is the baseline itself, {stated:g} m, multiply it by "
-        "the focal length"
+        f"baseline of {baseline:.2g} m; {'; '.join(readings)}"
     )
 
 

@@ -39,6 +39,10 @@ class _ImageSizeRules(NamedTuple):
 _IMAGE_SIZE = _ImageSizeRules()
 _NOTED = 1.02
 FAR_IMU_M = 10.0  # an IMU further from its camera is no length in metres
+# Likewise beside a short baseline: on cars, 2.5 m and 21 baselines (a camera of 0.12 m, an IMU at the
+# rear axle); a hand-held rig's lever arm in centimetres reads as 3 m and more.
+_FAR_BESIDE_M = 3.0
+_FAR_BASELINES = 40.0
 # A board's square is 0.02 to 0.1 m and a rig's baseline 0.05 to 0.6 m, so that in squares a
 # baseline is seldom below 1, and in metres seldom above.
 _SQUARES_M = 1.0
@@ -85,12 +89,23 @@ def _distance_doubt(rig: Rig, where: Path | str) -> str | None:
     if rig.T_cam0_imu is None:
         return None
     distance_m = float(np.linalg.norm(rig.T_cam0_imu[:3, 3]))
-    if distance_m <= FAR_IMU_M:
+    seen = (
+        f"{where}: doubtful: the IMU is {distance_m:.4g} m from the left camera, if the unit is the "
+        "metre; if it is the"
+    )
+    if distance_m > FAR_IMU_M:
+        return (
+            f"{seen} millimetre, it is {distance_m / 1000:.4g} m: divide the translation of its pose "
+            "by 1000"
+        )
+    if rig.cam1 is None or distance_m <= _FAR_BESIDE_M:
+        return None
+    baseline_m = float(np.linalg.norm(rig.right[1][:3, 3]))
+    if distance_m <= _FAR_BASELINES * baseline_m:
         return None
     return (
-        f"{where}: doubtful: the IMU is {distance_m:.4g} m from the left camera, if the unit is the "
-        f"metre; if it is the millimetre, it is {distance_m / 1000:.4g} m: divide the translation of "
-        "its pose by 1000"
+        f"{seen} centimetre, it is {distance_m / 100:.4g} m: divide the translation of its pose by "
+        f"100 (the cameras are {baseline_m:.3g} m apart)"
     )
 
 
@@ -159,6 +174,11 @@ def _size_doubt(camera: CameraModel, where: Path | str) -> str | None:
         else "if they were cropped, subtract what was cut from its principal points, or directions "
         "are off"
     )
+    if scaled and not camera.coefficients and not _is_even(ratios):
+        remedy += (
+            "; if it is that of rectified images and these are raw ones, of another size and form, "
+            "give theirs, with the distortion"
+        )
     return (
         f"{where}: doubtful: it states no image size, and its principal point {camera.cu:.0f}, "
         f"{camera.cv:.0f} is the middle of images of about {2 * camera.cu:.0f} x "
@@ -182,9 +202,14 @@ def _other_camera_doubt(camera: CameraModel, where: Path | str) -> str | None:
     )
 
 
+def _is_even(ratios: FloatArray) -> bool:
+    """Tell whether one factor explains the ratios (2,) of both axes."""
+    return bool(ratios.max() <= _IMAGE_SIZE.scaled_ratio * ratios.min())
+
+
 def _factors(ratios: FloatArray) -> str:
     """Return the factor of both axes, or one for each where they differ, as of stretched images."""
-    if ratios.max() <= _IMAGE_SIZE.scaled_ratio * ratios.min():
+    if _is_even(ratios):
         return f"{ratios.mean():.3g}"
     return f"{ratios[0]:.3g} along x and {ratios[1]:.3g} along y"
 

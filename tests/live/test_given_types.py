@@ -1,0 +1,41 @@
+"""What programs give in the place of a calibration, a recording or settings is refused with the call
+that makes it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import vio
+from vio.config import Config
+
+RIG = vio.Rig.rectified(300.0, 300.0, 159.5, 119.5, 0.1, 320, 240)
+
+
+@pytest.mark.parametrize("given", ["recording", Path("recording"), None, {"fx": 1.0}])
+@pytest.mark.parametrize("live", [vio.Odometry, vio.LiveOdometry])
+def test_a_rig_is_no_path(live: Any, given: object) -> None:
+    with pytest.raises(TypeError, match=r"give what vio.load_rig\(path\) returns"):
+        live(given)
+
+
+@pytest.mark.parametrize("live", [vio.Odometry, vio.LiveOdometry])
+def test_settings_are_no_dictionary(live: Any) -> None:
+    with pytest.raises(TypeError, match=r"give what vio.load_config\(...\) returns, not dict"):
+        live(RIG, {"motion": "none"})
+
+
+@pytest.mark.parametrize("given", ["recording", Path("recording"), None])
+def test_a_recording_is_no_path(given: Any) -> None:
+    with pytest.raises(TypeError, match=r"give what vio.open_dataset\(path\) returns"):
+        vio.run(given, Config())
+
+
+def test_settings_of_a_run_are_no_path() -> None:
+    dataset: Any = object()
+    settings: Any = "settings.yaml"
+    with pytest.raises(TypeError, match=r"give what vio.load_config\(...\) returns, not str"):
+        vio.run(dataset, settings)
