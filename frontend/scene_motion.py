@@ -14,7 +14,6 @@ from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.frontend.moving_object import (
     MIN_POINTS,
-    STATIC_FRAMES,
     TwoMotions,
     choose_motion,
     one_motion_explains,
@@ -61,8 +60,11 @@ class SceneChoice:
 class _ViewRules(NamedTuple):
     """When what was in view is gone, and when it has been left behind."""
 
-    unseen_frames: int = 3  # in a row, with fewer than so many points that were seen before
+    # in a row, with fewer than so many points of the last frame that had them: a chain, as points
+    # live for a few frames only in rain
+    unseen_frames: int = 3
     min_seen: int = 4
+    min_flow_px: float = 1.0  # of a motion that can be told from none
     extrapolated_frames: int = 10  # for which a motion goes on as it was, at most
     kept_share: float = 0.25  # of the points, that must still be in view by it to be missed
     # that points have been static for while an object was told from them, to be of the scene
@@ -89,6 +91,18 @@ class _Scene:
         T = np.linalg.matrix_power(self.motion.T_curr_prev, frames + 1)
         return _share_in_view(camera, transform_points(T, self.p_prev[self.motion.inliers]))
 
+    def goes_on(self, camera: StereoCamera, T: FloatArray, p_prev: FloatArray) -> bool:
+        """Whether pixels of points (N, 3) move both by a motion (4, 4) and by that of the scene: what
+        moves with the rig does not.
+        """
+        before = project(camera, p_prev)[:, :2]
+        for motion in (self.motion.T_curr_prev, T):
+            after = project(camera, transform_points(motion, p_prev))[:, :2]
+            flow_px = np.linalg.norm(after - before, axis=1)
+            if float(np.median(flow_px)) <= _VIEW.min_flow_px:
+                return False
+        return True
+
 
 class SceneMotion:
     """Chooses the camera's motion in each frame, and reports objects."""
@@ -98,7 +112,7 @@ class SceneMotion:
         # (M, 3) current cam0 frame, metres: what was in view when the last points that are older
         # than an object were lost; None: there are such points
         self._view: FloatArray | None = None
-        self._scene: _Scene | None = None  # the last frame in which points seen before proved it
+        self._scene: _Scene | None = None  # the last frame that shows points of the one before it
         self._unseen = 0  # frames since then, in a row
 
     @property
@@ -139,7 +153,12 @@ class SceneMotion:
             found,
             expected,
             voting=voting,
-            in_event=self._report.active or (measured is not None and self._is_lost(points, found)),
+            in_event=self._report.active
+            or (
+                measured is not None
+                and self._scene is not None
+                and not self._goes_on(index, points, found)
+            ),
             disparity_error_px=disparity_error_px,
         )
         if self._is_one_motion(problem, chosen, points, disparity_error_px):
@@ -169,11 +188,11 @@ class SceneMotion:
         hidden = self._report.hides_scene(index, chosen) and measured is None
         return SceneChoice(chosen.motion, chosen.object_share, hidden, slow)
 
-    def _is_lost(self, points: MovedPoints, found: Consensus) -> bool:
-        """Whether a consensus is that of points that were not seen before, and others were: a
-        sensor tells.
-        """
-        return self._scene is not None and _seen_before(points, found) < _VIEW.min_seen
+    def _goes_on(self, index: int, points: MovedPoints, motion: Consensus) -> bool:
+        """Whether points of the last frame of the scene follow a motion."""
+        frames = 1 if self._scene is None else index - self._scene.index
+        again = motion.inliers & (points.age >= frames)
+        return int(again.sum()) >= _VIEW.min_seen
 
     def _see_scene(
         self,
@@ -191,7 +210,10 @@ class SceneMotion:
         if self._report.since is not None:
             self._scene = None
             return
-        if _seen_before(points, motion) >= _VIEW.min_seen:
+        goes_on = self._goes_on(index, points, motion)
+        if not goes_on and self._scene is not None:
+            goes_on = self._scene.goes_on(camera, motion.T_curr_prev, points.p_prev)
+        if goes_on:
             self._scene = _Scene(index, points.p_prev, motion)
             self._unseen = 0
             return
@@ -239,11 +261,6 @@ class SceneMotion:
 def _are_enough(rows: BoolArray) -> bool:
     """Whether a mask (N,) is of enough points to prove a motion."""
     return int(rows.sum()) >= MIN_POINTS
-
-
-def _seen_before(points: MovedPoints, motion: Consensus) -> int:
-    """Number of the points that follow a motion and have been static for some frames."""
-    return int((motion.inliers & (points.age >= STATIC_FRAMES)).sum())
 
 
 def _share_in_view(camera: StereoCamera, p: FloatArray) -> float:

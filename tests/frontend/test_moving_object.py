@@ -611,6 +611,10 @@ class _Run:
         self._age[kept:] = 0
         self.index += skipped
 
+    def renew(self, part: int) -> None:
+        """A third of the points are replaced by others."""
+        self._age[part::3] = 0
+
 
 STILL = np.eye(4)
 SLOW = se3_exp([0.002, 0.0, -0.001, 0.0, 0.0002, 0.0])
@@ -677,3 +681,22 @@ def test_a_sensor_overrules_what_replaces_all_points_of_the_scene() -> None:
     assert run.said == ["object-hides-scene", "object-covers-image"]
     run.frames(40, moving, measured=prediction(moving))
     assert run.said[2:] == ["-object-covers-image", "-object-hides-scene"]
+
+
+def test_points_that_live_for_a_few_frames_only_are_of_the_scene_as_long_as_they_overlap() -> None:
+    """As in rain."""
+    run = _Run()
+    run.frames(8, SLOW)
+    for part in range(30):
+        run.renew(part % 3)
+        run.frames(1, SLOW)
+    assert run.said == []
+
+
+def test_another_view_of_a_rig_that_moves_on_is_the_scene() -> None:
+    """Joined recordings: what moves with the rig would not move in the image."""
+    run = _Run()
+    run.frames(8, se3_exp([0.05, 0.0, -0.1, 0.0, 0.01, 0.0]))
+    run.lose(0)
+    run.frames(30, se3_exp([-0.1, 0.02, -0.1, 0.01, 0.0, 0.0]))
+    assert run.said == []
