@@ -185,9 +185,7 @@ CODES: dict[str, Code] = {
     ),
     "frame-refused": Code("degraded", "the front end refused a frame", "see the message"),
     "frames-missing": Code("degraded", "no frame came for some time", _CAMERA),
-    "frames-repeated": Code(
-        "degraded", "frames or rows show an earlier exposure again", _CAMERA
-    ),
+    "frames-repeated": Code("degraded", "frames or rows show an earlier exposure again", _CAMERA),
     "images-held": Code(
         "unusable",
         "equal images were taken for a rig at standstill, and were an earlier exposure again",
