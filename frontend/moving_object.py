@@ -52,6 +52,7 @@ Decision: TypeAlias = Literal["predicted", "voted", "undecided", "unsupported"]
 # ratio of two motions' squared distances from a measured one, above which the nearer agrees
 CLEARLY_NEARER = 10.0
 MIN_POINTS = 12  # of a second motion
+STATIC_FRAMES = 5  # that a voting point must have been static for
 
 
 class _SecondMotion(NamedTuple):
@@ -84,12 +85,12 @@ class _VoteRules(NamedTuple):
     # errors of points of the scene over the median of those that are static for long: of 1000 one
     # more
     following_ratio: float = 3.2
-    voters: int = 50  # how many points vote, and for how many frames each must have been static
-    static_frames: int = 5
+    voters: int = 50  # how many points vote
     clear_share: float = 0.7  # share of the voting points that must follow a motion
 
 
 _VOTE = _VoteRules()
+_TORN_SHARE = 0.9  # of the points of either part of a torn image that are on its side of the tear
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +144,9 @@ def choose_motion(
     if len(case.others) < case.min_support and not (in_event or first.contradicted):
         return TwoMotions(found, 0.0, None)
     second = _second_motion(case, first)
+    chosen = _of_one_exposure(case, first, second)
+    if chosen is not None:
+        return chosen
     chosen = _elected_motion(case, second)
     return _predicted_motion(case, first, second) if chosen is None else chosen
 
@@ -271,6 +275,35 @@ def _second_motion(case: _Case, first: _First) -> _Second:
     else:
         follows = np.zeros(len(case.p_prev), dtype=np.bool_)
     return _Second(T, support, follows, exists, object_share)
+
+
+def _of_one_exposure(case: _Case, first: _First, second: _Second) -> TwoMotions | None:
+    """The second motion where an image is torn: the consensus is that of rows of another exposure,
+    and the other rows go on as predicted.
+
+    Points of the scene are older in either part, and the prediction may allow a stop.
+    """
+    if not second.exists or case.expected is None:
+        return None
+    found = case.found.inliers
+    rows = case.pixels[:, 1]
+    if not _lie_apart(rows[found & ~second.follows], rows[second.follows & ~found]):
+        return None
+    distance = case.expected.distance(second.T, case.p_prev[case.others[second.support]])
+    if distance > AGREEMENT_LIMIT or distance * CLEARLY_NEARER > first.distance:
+        return None
+    motion = Consensus(second.T, second.follows)
+    return TwoMotions(motion, case.without(second.follows), "predicted")
+
+
+def _lie_apart(rows: FloatArray, other: FloatArray) -> bool:
+    """Whether nearly all rows (N,) of some pixels are above, or below, those (M,) of others."""
+    if min(len(rows), len(other)) < MIN_POINTS:
+        return False
+    share = _TORN_SHARE
+    low, high = np.quantile(rows, (1.0 - share, share))
+    other_low, other_high = np.quantile(other, (1.0 - share, share))
+    return bool(high < other_low or other_high < low)
 
 
 def _elected_motion(case: _Case, second: _Second) -> TwoMotions | None:
@@ -617,4 +650,4 @@ def voters(age: IntArray) -> BoolArray:
         if len(age) > _VOTE.voters
         else 0
     )
-    return np.asarray(age >= max(oldest, _VOTE.static_frames))
+    return np.asarray(age >= max(oldest, STATIC_FRAMES))

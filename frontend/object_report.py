@@ -9,7 +9,7 @@ from typing import NamedTuple
 from vio.findings import Finder, Finding
 from vio.frontend.columns import share_of
 from vio.frontend.expected_motion import AGREEMENT_LIMIT, ExpectedMotion
-from vio.frontend.moving_object import CLEARLY_NEARER, MIN_POINTS, TwoMotions
+from vio.frontend.moving_object import CLEARLY_NEARER, MIN_POINTS, STATIC_FRAMES, TwoMotions
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, MotionPrior
@@ -27,6 +27,8 @@ class _EventRules(NamedTuple):
     hidden_share: float = 0.1
     hidden_frames: int = 3  # … in so many frames in a row
     clear_frames: int = 20  # without one before the next is another event
+    # in a row whose motion no older points prove, before what is seen may be the object alone
+    unproven_frames: int = 3
 
 
 _EVENT = _EventRules()
@@ -43,9 +45,12 @@ class ObjectReport(Finder):
         self._usual = deque[float](maxlen=_EVENT.clear_frames)
         self._frames = 0  # with an object, in a row
         self._since = 0  # the first of them
-        self._event_since = 0  # the first of the event that was reported
+        # points that are older than this frame are of the scene
+        self._event_since = 0
         self._decided = deque[int]()  # recent frames in which it was told from the scene
         self._clear = 0  # without one, in a row
+        self._proven = 0  # without one, and with a motion that is proven, in a row
+        self._unproven = 0  # whose motion is not, in a row
         self._hidden = 0  # that an object hides, in a row
         self._reported: str | None = None  # code of the event that goes on
         self._hidden_reported = False
@@ -60,8 +65,14 @@ class ObjectReport(Finder):
 
     @property
     def since(self) -> int | None:
-        """The first frame of the event that goes on, or has just ended; None: there is none."""
+        """The frame than which points of the scene are older, of the event that goes on; None:
+        there is none.
+        """
         return self._event_since if self._reported is not None else None
+
+    def prove(self, index: int) -> None:
+        """Take that points which are older than a frame are of the scene."""
+        self._event_since = max(self._event_since, index)
 
     def questioned(
         self,
@@ -107,11 +118,27 @@ class ObjectReport(Finder):
             self._found.append(Finding("object-hides-scene", message, index, lasts=True))
         return self._hidden >= _EVENT.hidden_frames
 
-    def frame(self, index: int, motions: TwoMotions) -> None:
-        """Take the motions of a frame."""
+    def lost(self, index: int, last: int) -> None:
+        """Report that the points of the scene are gone since a frame `last`, though the motion so
+        far would still show them.
+        """
+        self._event_since = last + 1
+        message = (
+            f"frame {index}: the points of frame {last} are gone, and its motion would still show "
+            "them: something hides the scene, or the rig was turned or pushed; what is seen is "
+            "taken for the scene"
+        )
+        self._begin_doubt(index, last + 1, message, {})
+
+    def frame(self, index: int, motions: TwoMotions, *, proven: bool = True) -> None:
+        """Take the motions of a frame; `proven`: a sensor, or points that are older than the event
+        that goes on, show that the chosen one is the camera's.
+        """
+        self._question(index, motions, proven=proven)
         if motions.object_share == 0.0:
-            self._no_object(index)
+            self._no_object(index, proven=proven)
             return
+        self._proven = 0
         if self._frames == 0:
             self._since = index
         self._frames = self._frames + 1
@@ -131,11 +158,23 @@ class ObjectReport(Finder):
         if (often or self._frames >= _EVENT.frames) and self._reported is None:
             self._report(index, motions)
 
-    def _no_object(self, index: int) -> None:
+    def _question(self, index: int, motions: TwoMotions, *, proven: bool) -> None:
+        """Report that what is seen may be the object alone, where it has hidden the scene."""
+        self._unproven = 0 if proven or self._reported is None else self._unproven + 1
+        if self._unproven < _EVENT.unproven_frames or self._reported == "object-or-scene":
+            return
+        message = (
+            f"frame {index}: hardly a point is left that is older than the object: the scene was "
+            "hidden, and what is seen may be the object alone; it is taken for the scene"
+        )
+        self._begin_doubt(index, index - self._unproven + 1, message, {})
+
+    def _no_object(self, index: int, *, proven: bool) -> None:
         self._frames = 0
         self._clear = self._clear + 1
+        self._proven = self._proven + 1 if proven else 0
         self._active = self._active and self._clear < _EVENT.frames
-        if self._reported is None or self._clear < _EVENT.clear_frames:
+        if self._reported is None or self._proven < _EVENT.clear_frames:
             return
         message = f"frame {index}: no object covers much of the image any more"
         self._found.append(Finding(self._reported, message, index, ended=True))
@@ -145,22 +184,28 @@ class ObjectReport(Finder):
         self._hidden_reported = False
 
     def _report_unsupported(self, index: int, motions: TwoMotions) -> None:
+        self._event_since = index - STATIC_FRAMES
         if self._reported == "object-or-scene":
             return
-        if self._reported is not None:
-            self._found.append(
-                Finding(self._reported, f"frame {index}: see below", index, ended=True)
-            )
-        self._reported = "object-or-scene"
         share = round(100 * motions.object_share)
         message = (
             f"frame {index}: {share} % of the points move as the rig did not before, and hardly "
             "one of them was seen before: the rig was pushed, or an object hides the scene; they "
             "are taken for the scene"
         )
-        figures = {"object_share": motions.object_share}
+        self._begin_doubt(index, index, message, {"object_share": motions.object_share})
+
+    def _begin_doubt(self, index: int, since: int, message: str, figures: dict[str, float]) -> None:
+        """Report that nothing tells whether what is seen is the scene, in place of what was
+        reported before.
+        """
+        if self._reported is not None:
+            self._found.append(
+                Finding(self._reported, f"frame {index}: see below", index, ended=True)
+            )
+        self._reported = "object-or-scene"
         self._found.append(
-            Finding("object-or-scene", message, index, index, lasts=True, figures=figures)
+            Finding(self._reported, message, index, since, lasts=True, figures=figures)
         )
 
     def _report(self, index: int, motions: TwoMotions) -> None:

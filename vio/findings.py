@@ -177,7 +177,7 @@ CODES: dict[str, Code] = {
     ),
     "object-or-scene": Code(
         "unusable",
-        "two groups of points move differently, and nothing decides which one is the scene",
+        "points move apart, or an object hid the scene; nothing tells which",
         "add an IMU, or mask what moves with the rig (frontend.klt.mask)",
     ),
     "object-hides-scene": Code(
@@ -185,7 +185,7 @@ CODES: dict[str, Code] = {
     ),
     "frame-refused": Code("degraded", "the front end refused a frame", "see the message"),
     "frames-missing": Code("degraded", "no frame came for some time", _CAMERA),
-    "frames-repeated": Code("degraded", "frames show an earlier exposure again", _CAMERA),
+    "frames-repeated": Code("degraded", "frames or rows show an earlier exposure again", _CAMERA),
     "images-held": Code(
         "unusable",
         "equal images were taken for a rig at standstill, and were an earlier exposure again",

@@ -559,3 +559,144 @@ def test_a_prediction_that_is_no_number_is_not_used() -> None:
         TrackPrior(np.array([1]), np.array([[1.0, 2.0, 0.0, 2.0]]), np.eye(3), prediction())
     )
     assert good.motion is not None
+
+
+def test_the_rows_of_another_exposure_are_left_out_of_a_torn_image() -> None:
+    """The larger part does not move, the other moves as predicted; points of both are old."""
+    p = scene(400, 12, (8.0, 40.0))
+    before = project(CAMERA, p)[:, :2]
+    upper = before[:, 1] < np.quantile(before[:, 1], 0.6)
+    uv = np.where(upper[:, None], before, pixels(T_TRUE, p, 14))
+    expected = replace(prediction(), measured=False)
+    expected = replace(expected, covariance=np.diag(np.repeat([0.3, 0.03], 3) ** 2))
+    found = Consensus(np.eye(4), pixel_errors(CAMERA, np.eye(4), p, uv) <= LIMIT_PX)
+    old = np.ones(len(p), dtype=np.bool_)
+    chosen = choose_motion(make_problem(), p, uv, found, expected, voting=old)
+    assert chosen.decision == "predicted"
+    assert chosen.motion.T_curr_prev == pytest.approx(T_TRUE, abs=0.02)
+    assert chosen.motion.inliers[upper].mean() < 0.2
+    assert chosen.motion.inliers[~upper].mean() > 0.9
+    # the same two groups, spread over all rows: an object, on which the old points do not agree
+    mixed = np.arange(len(p)) % 5 < 3
+    uv = np.where(mixed[:, None], before, pixels(T_TRUE, p, 14))
+    found = Consensus(np.eye(4), pixel_errors(CAMERA, np.eye(4), p, uv) <= LIMIT_PX)
+    chosen = choose_motion(make_problem(), p, uv, found, expected, voting=old)
+    assert chosen.motion.T_curr_prev == pytest.approx(np.eye(4), abs=0.02)
+
+
+class _Run:
+    """Frames whose points all follow one motion."""
+
+    def __init__(self) -> None:
+        self.motion = SceneMotion()
+        self.index = 0
+        self.said: list[str] = []
+        self._p = scene(200, 12, (5.0, 20.0))
+        self._age = np.zeros(200, dtype=np.int64)
+
+    def frames(self, count: int, T: FloatArray, *, measured: MotionPrior | None = None) -> None:
+        prior = None
+        if measured is not None:
+            prior = TrackPrior(np.zeros(0, np.int64), np.zeros((0, 4)), None, measured)
+        for _ in range(count):
+            points = MovedPoints(self._p, pixels(T, self._p, 3, 0.05), self._age)
+            found = Consensus(T, np.ones(len(self._p), dtype=np.bool_))
+            chosen = self.motion.choose(self.index, make_problem(), points, found, prior, 0.0)
+            self._age = np.where(chosen.static, self._age + 1, 0)
+            self.said += [f"-{f.code}" if f.ended else f.code for f in self.motion.take_findings()]
+            self.index += 1
+
+    def lose(self, kept: int, skipped: int = 0) -> None:
+        """All points but a few are replaced by others, after frames without a motion."""
+        self._age[kept:] = 0
+        self.index += skipped
+
+    def renew(self, part: int) -> None:
+        """A third of the points are replaced by others."""
+        self._age[part::3] = 0
+
+
+STILL = np.eye(4)
+SLOW = se3_exp([0.002, 0.0, -0.001, 0.0, 0.0002, 0.0])
+
+
+def test_what_replaces_all_points_of_the_scene_at_once_is_doubted_while_it_stays() -> None:
+    run = _Run()
+    run.frames(8, SLOW)
+    run.lose(0, skipped=3)
+    run.frames(60, STILL)
+    assert run.said == ["object-or-scene"]
+
+
+def test_points_of_the_scene_that_are_left_prove_its_motion() -> None:
+    run = _Run()
+    run.frames(8, SLOW)
+    run.lose(5)
+    run.frames(60, SLOW)
+    assert run.said == []
+
+
+def test_new_points_are_no_event_where_the_motion_has_left_the_old_ones_behind() -> None:
+    run = _Run()
+    run.frames(8, se3_exp([0.0, 0.0, -1.5, 0.0, 0.15, 0.0]))
+    run.lose(0, skipped=5)
+    run.frames(30, SLOW)
+    assert run.said == []
+
+
+def test_what_was_doubted_is_the_scene_once_all_of_it_has_passed() -> None:
+    run = _Run()
+    run.frames(8, SLOW)
+    run.lose(0)
+    run.frames(10, STILL)
+    assert run.said == ["object-or-scene"]
+    run.frames(60, se3_exp([0.0, 0.0, -1.0, 0.0, 0.0, 0.0]))
+    assert run.said == ["object-or-scene", "-object-or-scene"]
+
+
+def test_an_object_that_has_hidden_the_scene_is_doubted_when_it_stops() -> None:
+    """No point is older than it any more."""
+    p, uv, truck = scenery(120, 100)
+    motion = SceneMotion()
+    age = np.where(truck, 0, 50)
+    codes = []
+    for index in range(60):
+        points = MovedPoints(p, uv, age)
+        found = rigid_consensus(make_problem(), p, uv, T_TRUE, None, None)
+        if index >= 8:
+            points = MovedPoints(p, pixels(STILL, p, 3, 0.05), np.full(len(p), index - 8))
+            found = Consensus(STILL, np.ones(len(p), dtype=np.bool_))
+        assert found is not None
+        motion.choose(index, make_problem(), points, found, None, 0.0)
+        codes += [f"-{f.code}" if f.ended else f.code for f in motion.take_findings()]
+    assert codes == ["object-covers-image", "-object-covers-image", "object-or-scene"]
+
+
+def test_a_sensor_overrules_what_replaces_all_points_of_the_scene() -> None:
+    moving = se3_exp([0.02, 0.0, -0.05, 0.0, 0.002, 0.0])
+    run = _Run()
+    run.frames(8, moving, measured=prediction(moving))
+    run.lose(0)
+    run.frames(10, STILL, measured=prediction(moving))
+    assert run.said == ["object-hides-scene", "object-covers-image"]
+    run.frames(40, moving, measured=prediction(moving))
+    assert run.said[2:] == ["-object-covers-image", "-object-hides-scene"]
+
+
+def test_points_that_live_for_a_few_frames_only_are_of_the_scene_as_long_as_they_overlap() -> None:
+    """As in rain."""
+    run = _Run()
+    run.frames(8, SLOW)
+    for part in range(30):
+        run.renew(part % 3)
+        run.frames(1, SLOW)
+    assert run.said == []
+
+
+def test_another_view_of_a_rig_that_moves_on_is_the_scene() -> None:
+    """Joined recordings: what moves with the rig would not move in the image."""
+    run = _Run()
+    run.frames(8, se3_exp([0.05, 0.0, -0.1, 0.0, 0.01, 0.0]))
+    run.lose(0)
+    run.frames(30, se3_exp([-0.1, 0.02, -0.1, 0.01, 0.0, 0.0]))
+    assert run.said == []

@@ -45,9 +45,9 @@ def test_a_view_of_which_nothing_is_left_is_named() -> None:
 
 
 def test_the_few_features_that_are_left_must_contradict_the_motion() -> None:
-    assert _codes([*USUAL, 130], 4.0) == ["view-changed"]  # 20 of 100
-    assert _codes([*USUAL, 130], 3.9) == []
-    assert _codes([*USUAL, 129], 4.0) == []
+    assert _codes([*USUAL, 128], 2.0) == ["view-changed"]  # 22 of 100, a quarter of 90
+    assert _codes([*USUAL, 128], 1.9) == []
+    assert _codes([*USUAL, 127], 2.0) == []
 
 
 def test_a_motion_sensor_has_measured_the_motion() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -19,11 +20,13 @@ from tools.faults.changes import (
     gap,
     pairs,
     pairs_during,
+    to_gray,
     with_events,
+    with_frames,
 )
 from vio.geometry.lie import so3_exp
 from vio.protocols import Dataset
-from vio.records import Image, StereoFrame
+from vio.records import Event, Image, ImuSample, StereoFrame
 
 
 def late_images(dataset: Dataset, period: Period, late: int, frames: int = 1) -> PairChange:
@@ -65,11 +68,7 @@ class Wall:
 
 def moving_object(dataset: Dataset, period: Period, wall: Wall) -> PairChange:
     """A wall covers a part of both images during the fault's period."""
-    noise = np.random.default_rng(wall.seed).integers(0, 256, (1200, 6000)).astype(np.uint8)
-    texture = blurred(noise, 3.0)
-    texture = np.asarray(
-        cv2.normalize(texture, texture.copy(), 20, 235, cv2.NORM_MINMAX), dtype=np.uint8
-    )
+    texture = _texture(np.random.default_rng(wall.seed), 1200)
     first: list[int] = []
 
     def covered(frame: StereoFrame, left: Image, right: Image) -> Pair:
@@ -88,6 +87,126 @@ def moving_object(dataset: Dataset, period: Period, wall: Wall) -> PairChange:
         return left, right
 
     return covered
+
+
+@dataclass(frozen=True, slots=True)
+class Cover:
+    """Something near that slides into the view, stays with the rig, and slides out again."""
+
+    share: float  # of the image, once it is there
+    frames: int  # that it slides for
+    disparity_px: int = 40
+    axis: int = 1  # slides along columns (1) or rows (0)
+    sway_px: float = 0.0  # standard deviation of its place, in a frame
+    seed: int = 7  # of its texture
+
+
+def covering_object(dataset: Dataset, period: Period, cover: Cover) -> PairChange:
+    """Something covers most of both images and moves with the rig during the fault's period."""
+    rng = np.random.default_rng(cover.seed)
+    texture = _texture(rng, 4000)
+    at = 0  # how far it is in, in frames
+
+    def covered(frame: StereoFrame, left: Image, right: Image) -> Pair:
+        nonlocal at
+        at = min(at + 1, cover.frames) if period.holds(frame.time_ns) else max(at - 1, 0)
+        if at == 0:
+            return left, right
+        size = left.shape[cover.axis]
+        seen = round(cover.share * size * at / cover.frames)
+        sway = np.rint(rng.normal(0.0, 1.0, 2) * cover.sway_px).astype(np.int64)
+        out = []
+        for k, image in enumerate((left, right)):
+            # it comes from the end of the rows, or from below
+            height, width = image.shape
+            row = 2000 + int(sway[1])
+            column = 3000 + int(sway[0]) + k * cover.disparity_px
+            hidden = np.zeros(image.shape, dtype=np.bool_)
+            if cover.axis == 1:
+                column += seen - size
+                hidden[:, max(size - seen - k * cover.disparity_px, 0) :] = True
+            else:
+                row += seen - size
+                hidden[size - seen :] = True
+            wall = texture[row : row + height, column : column + width]
+            noisy = to_gray(wall + rng.normal(0.0, 2.0, image.shape))
+            out.append(np.where(hidden, noisy, image))
+        return out[0], out[1]
+
+    return covered
+
+
+def _texture(rng: np.random.Generator, rows: int) -> Image:
+    """A texture of blurred noise, wider than images."""
+    noise = rng.integers(0, 256, (rows, 6000)).astype(np.uint8)
+    texture = blurred(noise, 3.0)
+    return np.asarray(
+        cv2.normalize(texture, texture.copy(), 20, 235, cv2.NORM_MINMAX), dtype=np.uint8
+    )
+
+
+def torn_images(
+    dataset: Dataset, period: Period, every: int, share: float, *cameras: int
+) -> PairChange:
+    """The upper part of every some image of some cameras is that of the frame before."""
+    before: list[Pair] = []
+
+    def torn(frame: StereoFrame, *pair: Image) -> Pair:
+        out = list(pair)
+        if before and period.holds(frame.time_ns) and frame.index % every == 0:
+            for k in cameras:
+                rows = round(share * len(pair[k]))
+                out[k] = np.concatenate([before[0][k][:rows], pair[k][rows:]])
+        before[:] = [(pair[0], pair[1])]
+        return out[0], out[1]
+
+    return torn
+
+
+def cut(*, samples: bool) -> Variant:
+    """The frames of the fault's period are left out, and the stamps go on as if they had not been;
+    `samples`: those of the IMU, too.
+    """
+
+    def variant(dataset: Dataset, period: Period) -> Changed:
+        recording = dataset.recording
+        times_ns = recording.frame_times_ns
+        inside = np.array([period.holds(time_ns) for time_ns in times_ns.tolist()])
+        # a whole number of frames is missing
+        gone_ns = int(times_ns[inside][-1] - times_ns[inside][0]) + int(
+            np.median(np.diff(times_ns))
+        )
+        end_ns = int(times_ns[inside][0]) + gone_ns
+
+        def now_ns(time_ns: int) -> int:
+            return time_ns if time_ns < end_ns else time_ns - gone_ns
+
+        def shifted(events: Iterable[Event]) -> Iterator[Event]:
+            moved = []
+            for event in events:
+                of_imu = isinstance(event, ImuSample)
+                if of_imu and not samples:
+                    moved.append(event)
+                elif not (of_imu and period.begin_ns <= event.time_ns < end_ns):
+                    moved.append(replace(event, time_ns=now_ns(event.time_ns)))
+            yield from sorted(moved, key=lambda e: (e.time_ns, isinstance(e, StereoFrame)))
+
+        reference = recording.reference
+        if reference is not None and reference.times_ns is not None:
+            left = (reference.times_ns < period.begin_ns) | (reference.times_ns >= end_ns)
+            stamps = np.array([now_ns(t) for t in reference.times_ns[left].tolist()])
+            reference = replace(
+                reference,
+                T_world_body=reference.T_world_body[left],
+                times_ns=stamps,
+                frame_indices=None,
+            )
+        stamps = np.array([now_ns(t) for t in times_ns[~inside].tolist()])
+        changed = with_frames(dataset, ~inside, shifted)
+        recording = replace(changed.recording, frame_times_ns=stamps, reference=reference)
+        return replace(changed, recording=recording)
+
+    return variant
 
 
 def turned_right(

@@ -9,12 +9,16 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from tools.faults.cameras import (
+    Cover,
     Wall,
+    covering_object,
+    cut,
     frozen_images,
     late_images,
     moving_object,
     repeated_pairs,
     shaking_right,
+    torn_images,
     turned_right,
     wrong_calibration,
 )
@@ -105,6 +109,24 @@ def _object(size: float, rng: np.random.Generator) -> Variant:
     disparity_px = int(rng.integers(10, 40))
     seed = int(rng.integers(1000))
     return pairs(moving_object, Wall(speed_px, share, begin, disparity_px, seed))
+
+
+def _covered(size: float, rng: np.random.Generator) -> Variant:
+    frames = int(rng.integers(2, 16))
+    disparity_px = int(rng.integers(15, 60))
+    axis = int(rng.integers(2))
+    sway_px = float(rng.uniform(0.0, 0.6))
+    seed = int(rng.integers(1000))
+    return pairs(covering_object, Cover(size, frames, disparity_px, axis, sway_px, seed))
+
+
+def _torn(size: float, rng: np.random.Generator) -> Variant:
+    cameras = [(0,), (1,), (0, 1)][int(rng.integers(3))]
+    return pairs(torn_images, int(rng.integers(2, 6)), size, *cameras)
+
+
+def _cut(size: float, rng: np.random.Generator) -> Variant:
+    return cut(samples=rng.random() < 0.5)
 
 
 def _turned(*, all_along: bool) -> Make:
@@ -293,6 +315,9 @@ KINDS: dict[str, Kind] = {
     "silent": Kind("imu", "period", 1, 1, "", _constant(gap(frames=False, samples=True))),
     "dead": Kind("imu", "onwards", 1, 1, "", _constant(_readings_after(lambda sample: None))),
     "shock": Kind("imu", "onwards", 0.3, 6.0, "rad/s", _shock),
+    "covered": Kind("cameras", "period", 0.7, 1.0, "of the image", _covered),
+    "torn": Kind("cameras", "period", 0.2, 0.8, "of the rows", _torn),
+    "cut": Kind("cameras", "onwards", 1, 1, "", _cut),
 }
 # Every second kind is kept aside: the two of a similar pair come to different halves.
 HALVES: dict[str, Half] = {

@@ -18,6 +18,7 @@ from vio.guard.pairing import PairingCheck
 from vio.guard.probe import RowProbe
 from vio.guard.projected_dots import ProjectedDots
 from vio.guard.swap import SwapDetector
+from vio.guard.torn import TornImages
 from vio.guard.turned_pair import TurnedPair
 from vio.protocols import ChecksMatches, ChecksObjects, FollowsRight, Frontend
 from vio.records import (
@@ -41,9 +42,10 @@ def image_checks(camera: StereoCamera) -> tuple[ImageCheck, ...]:
     a turned camera does not have.
     """
     if camera.kind != "stereo":
-        return (ProjectedDots(), LostContrast())
+        return (TornImages(), ProjectedDots(), LostContrast())
     probe = RowProbe()
     return (
+        TornImages(),
         BandRemoval(),
         ProjectedDots(),
         LostContrast(),
