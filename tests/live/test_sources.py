@@ -602,7 +602,9 @@ def test_an_oak_takes_each_lens_model_as_it_is(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("name", ["brown_conrady", "inverse_brown_conrady"])
 def test_a_realsense_lens_projects_as_librealsense(name: str) -> None:
-    rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed")
+    rs = pytest.importorskip(
+        "pyrealsense2", reason="pyrealsense2 or libusb is not installed", exc_type=ImportError
+    )
     found = rs.intrinsics()
     found.width, found.height, found.fx, found.fy = 640, 480, 430.0, 430.0
     found.ppx, found.ppy, found.model = 322.0, 238.0, getattr(rs.distortion, name)
