@@ -82,7 +82,7 @@ def _suspicion(
     reference: int = 100,
 ) -> str:
     rows = np.linspace(0, last, matched).astype(np.int64)
-    return " ".join(_notes(short_m, long_m, rows, _trajectory(100), _trajectory(reference)))
+    return " ".join(_notes(short_m, long_m, rows, _trajectory(100), _trajectory(reference), None))
 
 
 def _has_scale(poses: int) -> bool:
@@ -101,7 +101,7 @@ def _other_order(as_read_deg: float, exchanged_deg: float) -> bool:
         np.tile(np.eye(4), (5, 1, 1)), np.arange(5), "imu", orientations="w last, assumed"
     )
     spreads = iter([as_read_deg, exchanged_deg, 1e3, 1e3])
-    with patch.object(quaternion_order, "_spread_deg", lambda *_: next(spreads)):
+    with patch.object(quaternion_order, "_spread_deg", lambda *_, **__: next(spreads)):
         return bool(quaternion_order.settled_orders(assumed, _trajectory(5), 0.01)[2])
 
 

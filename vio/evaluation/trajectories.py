@@ -373,7 +373,9 @@ def _notes(
         which = "the reference" if reference_m > estimate_m else "the estimate"
         if units:
             what = f"{which} seems to be in {next(iter(units))}"
-        elif scale_free is not None and scale_free.ate_m < _SUSPECT.alike_share * reference_m:
+        elif scale_free is not None and scale_free.ate_m < _SUSPECT.alike_share * (
+            _extent(estimate.T_world_body[rows]) / scale_free.scale
+        ):
             what = (
                 f"scaled by {1 / scale_free.scale:.3g}, the estimate follows it to "
                 f"{metres_text(scale_free.ate_m)}: its lengths have no scale, as of one camera alone, "
@@ -399,6 +401,12 @@ def _notes(
             "is it the reference of this recording, on the same clock?"
         )
     return tuple(notes)
+
+
+def _extent(T_world_body: FloatArray) -> float:
+    """Root mean square distance of the positions of poses (N, 4, 4) from their mean, metres."""
+    p = T_world_body[:, :3, 3]
+    return float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _row_note(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
