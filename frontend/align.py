@@ -139,18 +139,19 @@ def _radius(size: int) -> int:
 
 
 def warped_patches(image: Image, warp: FloatArray, radius: int) -> Pixels:
+    """Gray levels (N, S) of an image at the pixels of a square patch under warps (N, 2, 3)."""
+    return _gray_levels(image, warp, offsets(radius))
+
+
+def warped_discs(image: Image, warp: FloatArray, radius: int) -> Pixels:
+    """Gray levels (N, S) of an image at the pixels of a template under warps (N, 2, 3)."""
+    return _gray_levels(image, warp, disc(radius))
+
+
+def _gray_levels(image: Image, warp: FloatArray, xy: Pixels) -> Pixels:
     """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's
     border is repeated.
     """
-    out = np.empty((len(warp), (2 * radius + 1) ** 2), dtype=np.float32)
-    image = np.ascontiguousarray(image)
-    _sample_all(image, _pairs(image), warp, offsets(radius), out)
-    return out
-
-
-def patches_under(image: Image, warp: FloatArray, radius: int) -> Pixels:
-    """Gray levels (N, S) of an image at the pixels of `disc` under warps (N, 2, 3)."""
-    xy = disc(radius)
     out = np.empty((len(warp), xy.shape[1]), dtype=np.float32)
     image = np.ascontiguousarray(image)
     _sample_all(image, _pairs(image), warp, xy, out)

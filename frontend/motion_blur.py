@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vio.frontend.align import Disc, Pixels, disc_of, patches_under
+from vio.frontend.align import Disc, Pixels, disc_of, warped_discs
 from vio.frontend.blurring import MAX_SPREAD_PX2
 from vio.frontend.tracks import AnchorBank
 from vio.geometry.lie import FloatArray
@@ -85,7 +85,7 @@ class MotionBlur:
         bank = self._bank
         _add_features(
             bank.blurred(slots),
-            patches_under(image, warp[rows], bank.radius_px),
+            warped_discs(image, warp[rows], bank.radius_px),
             disc_of(bank.radius_px),
             _Moving(
                 warp[rows],

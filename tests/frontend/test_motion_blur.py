@@ -123,24 +123,23 @@ def test_features_are_found_more_exactly_in_blurred_images() -> None:
     assert blurred_px < 0.6 * sharp_px
 
 
-def test_a_path_longer_than_the_margin_is_blurred_as_far_as_that_reaches() -> None:
+def _spread_at(first: float, second: float) -> FloatArray:
+    """Spread (3,) of an anchor that was cut at a velocity and is aligned at another, px/s."""
     bank = AnchorBank(1, 9)
     slots = bank.add(_image(_scene(), np.zeros(2), np.zeros(2), 0.0), rounded(_POINTS[:1]))
     blur = MotionBlur(bank)
     blur.shutter_s2 = 1.0
-    for velocity in (0.0, 50.0):
+    for velocity in (first, second):
         blur.apply(slots, shift_warps(_POINTS[:1]), np.array([[velocity, 0.0]]))
-    assert bank.spread[slots] == pytest.approx(np.array([[MAX_SPREAD_PX2, 0.0, 0.0]]))
+    return bank.spread[slots[0]]
+
+
+def test_a_path_longer_than_the_margin_is_blurred_as_far_as_that_reaches() -> None:
+    assert _spread_at(0.0, 50.0) == pytest.approx(np.array([MAX_SPREAD_PX2, 0.0, 0.0]))
 
 
 def test_an_anchor_blurrier_than_the_image_stays_as_it_is() -> None:
-    bank = AnchorBank(1, 9)
-    slots = bank.add(_image(_scene(), np.zeros(2), np.zeros(2), 0.0), rounded(_POINTS[:1]))
-    blur = MotionBlur(bank)
-    blur.shutter_s2 = 1.0
-    for velocity in (1.0, 0.4):
-        blur.apply(slots, shift_warps(_POINTS[:1]), np.array([[velocity, 0.0]]))
-    assert not bank.spread.any()
+    assert not _spread_at(1.0, 0.4).any()
 
 
 def _asked(features: int) -> FloatArray:

@@ -79,8 +79,8 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
     y = T_ref[:, :3, 3]
     x_mean = x.mean(axis=0)
     y_mean = y.mean(axis=0)
-    x_extent = _extent(x)
-    y_extent = _extent(y)
+    x_extent = extent_m(x)
+    y_extent = extent_m(y)
     covariance = (y - y_mean).T @ (x - x_mean) / len(x)
     U, d, Vt = np.linalg.svd(covariance)
     sign = np.array([1.0, 1.0, 1.0 if np.linalg.det(U @ Vt) > 0 else -1.0])
@@ -155,9 +155,9 @@ def apply_alignment(alignment: Alignment, T_est: FloatArray) -> FloatArray:
     return se3_from_parts(alignment.R @ T_est[:, :3, :3], p)
 
 
-def _extent(p: FloatArray) -> float:
-    """Root mean square distance from the centroid; 0 where it is within rounding of the
-    coordinates.
+def extent_m(p: FloatArray) -> float:
+    """Root mean square distance of positions (N, 3) from their centroid, metres; 0 where it is
+    within rounding of the coordinates.
     """
     off_m = p - p.mean(axis=0)
     extent = float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.evaluation.alignment import Alignment, align_poses
+from vio.evaluation.errors_along_path import path_length_m
 from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, so3_hat
 from vio.numerics.kinds import Tolerance
 from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
@@ -56,7 +57,7 @@ def position_fault(
     y = T_ref[:, :3, 3]
     if len(x) < _FAULT.min_poses:
         return None
-    path_m = float(np.linalg.norm(np.diff(y, axis=0), axis=1).sum())
+    path_m = path_length_m(y)
     error_m = float(_errors(x, y)[0])
     if not error_m > _FAULT.min_share * path_m:
         return None
@@ -93,7 +94,7 @@ def lever_arm_note(T_est: FloatArray, T_ref: FloatArray) -> str | None:
     y = T_ref[every, :3, 3]
     if len(y) < _FAULT.min_poses:
         return None
-    path_m = float(np.linalg.norm(np.diff(y, axis=0), axis=1).sum())
+    path_m = path_length_m(y)
     arms = []
     for scaled in (False, True):
         start = align_poses(T_est, T_ref[every], "sim3" if scaled else "se3")

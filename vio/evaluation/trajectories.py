@@ -20,6 +20,7 @@ from vio.evaluation.alignment import (
     align_poses,
     apply_alignment,
     deviation_about_path,
+    extent_m,
     settle_rotation,
 )
 from vio.evaluation.association import AssociationMode, Coverage, associate, coverage, take
@@ -64,7 +65,7 @@ class _SuspicionRules:
     # a ratio of path lengths so near one of these is no chance; odometry without a scale has any
     # ratio
     unit_share: float = 0.1
-    # of the path of the reference: error after an alignment with scale, below which shapes agree
+    # of the extent of the reference: error after an alignment with scale, below which shapes agree
     alike_share: float = 0.05
     path_min_m: float = 1.0  # paths below this may consist of noise
     matched_share: float = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
@@ -374,7 +375,7 @@ def _notes(
         if units:
             what = f"{which} seems to be in {next(iter(units))}"
         elif scale_free is not None and scale_free.ate_m < _SUSPECT.alike_share * (
-            _extent(estimate.T_world_body[rows]) / scale_free.scale
+            extent_m(estimate.T_world_body[rows, :3, 3]) / scale_free.scale
         ):
             what = (
                 f"scaled by {1 / scale_free.scale:.3g}, the estimate follows it to "
@@ -401,12 +402,6 @@ def _notes(
             "is it the reference of this recording, on the same clock?"
         )
     return tuple(notes)
-
-
-def _extent(T_world_body: FloatArray) -> float:
-    """Root mean square distance of the positions of poses (N, 4, 4) from their mean, metres."""
-    p = T_world_body[:, :3, 3]
-    return float(np.sqrt(((p - p.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _row_note(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:

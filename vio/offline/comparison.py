@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.errors import EvaluationError
-from vio.evaluation.alignment import align_poses, apply_alignment
+from vio.evaluation.alignment import align_poses, apply_alignment, extent_m
 from vio.evaluation.association import take
 from vio.evaluation.errors_along_path import path_length_m, rotation_angle_deg
 from vio.evaluation.trajectories import evaluate
@@ -203,7 +203,6 @@ def _scale_ratio(
     there is none.
     """
     p = T_own[:, :3, 3]
-    extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
     if len(p) < 3:
         return None, None, f"only {len(p)} keyframes are connected"
     try:
@@ -212,6 +211,7 @@ def _scale_ratio(
         return None, None, "the camera does not move (pure rotation or standstill)"
     residual = apply_alignment(alignment, T_other)[:, :3, 3] - p
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
+    extent = extent_m(p)
     sigma = rms / (extent * np.sqrt(len(p)))
     if sigma > _MOTIONS.scale_sigma:
         return (
