@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from vio.frontend.patches import Patches
 from vio.geometry.lie import FloatArray
@@ -13,6 +14,8 @@ from vio.records import IntArray
 _STEP_PX2: Tolerance[float] = 0.5  # of a diffusion, which takes a pixel of the margin
 MARGIN_PX = 6  # of a patch, beyond what is returned of it
 MAX_SPREAD_PX2 = MARGIN_PX * _STEP_PX2  # trace of a covariance: a path of 6 px
+
+Row = npt.NDArray[np.float32]  # (N,) pixels
 
 
 def spread_out(sharp: Patches, spread: FloatArray, slots: IntArray) -> Patches:
@@ -38,38 +41,56 @@ def spread_out(sharp: Patches, spread: FloatArray, slots: IntArray) -> Patches:
 @compiled
 def _spread_out(sharp: Patches, spread: FloatArray, slots: IntArray, out: Patches) -> None:
     whole = sharp.shape[1]
-    before = np.empty((whole, whole), np.float32)
-    after = np.empty((whole, whole), np.float32)
+    pixels = whole * whole
+    side = out.shape[1]
+    rooms = np.empty((2, pixels), np.float32)
     for n, slot in enumerate(slots):
         trace = spread[slot, 0] + spread[slot, 1]
         steps = int(np.ceil(trace / _STEP_PX2 - 1e-9))
-        first = MARGIN_PX - steps
-        for i in range(first, whole - first):
-            for j in range(first, whole - first):
-                before[i, j] = sharp[slot, i, j]
         share = 0.5 / max(steps, 1)
         uu = np.float32(share * spread[slot, 0])
         vv = np.float32(share * spread[slot, 1])
         uv = np.float32(0.5 * share * spread[slot, 2])
-        for step in range(first + 1, MARGIN_PX + 1):
-            for i in range(step, whole - step):
-                for j in range(step, whole - step):
-                    middle = before[i, j] + before[i, j]
-                    after[i, j] = (
-                        before[i, j]
-                        + uu * (before[i, j - 1] - middle + before[i, j + 1])
-                        + vv * (before[i - 1, j] - middle + before[i + 1, j])
-                        + uv
-                        * (
-                            before[i + 1, j + 1]
-                            - before[i + 1, j - 1]
-                            - before[i - 1, j + 1]
-                            + before[i - 1, j - 1]
-                        )
-                    )
-            for i in range(step, whole - step):
-                for j in range(step, whole - step):
-                    before[i, j] = after[i, j]
-        for i in range(out.shape[1]):
-            for j in range(out.shape[1]):
-                out[n, i, j] = before[MARGIN_PX + i, MARGIN_PX + j]
+        patch = sharp[slot].reshape(pixels)
+        for step in range(MARGIN_PX - steps + 1, MARGIN_PX + 1):
+            after = rooms[step % 2]
+            first = step * (whole + 1)
+            _diffuse(patch, first, pixels - 2 * first, whole, uu, vv, uv, after)
+            patch = after
+        for i in range(side):
+            first = (MARGIN_PX + i) * whole + MARGIN_PX
+            for j in range(side):
+                out[n, i, j] = patch[first + j]
+
+
+@compiled
+def _diffuse(
+    before: Row,
+    first: int,
+    count: int,
+    whole: int,
+    uu: np.float32,
+    vv: np.float32,
+    uv: np.float32,
+    after: Row,
+) -> None:
+    """Write a step for `count` pixels from `first` on, row by row of `whole` pixels.
+
+    Pixels at the ends of the rows get neighbours of other rows: they are of the margin. One loop
+    over all rows, without indices that may be negative, takes the processor's vectors.
+    """
+    above = before[first - whole - 1 :]
+    row = before[first - 1 :]
+    below = before[first + whole - 1 :]
+    out = after[first:]
+    one = np.uint64(1)
+    two = np.uint64(2)
+    for k in range(np.uint64(count)):
+        pixel = row[k + one]
+        middle = pixel + pixel
+        out[k] = (
+            pixel
+            + uu * (row[k] - middle + row[k + two])
+            + vv * (above[k + one] - middle + below[k + one])
+            + uv * (below[k + two] - below[k] - above[k + two] + above[k])
+        )
