@@ -125,6 +125,14 @@ class FrontendSettings(Section):
         "precomputed front end",
     )
     prior: bool = setting(True, "give the front end the filter's prediction of the feature pixels")
+    readout_ms: float | None = setting(
+        None,
+        "rolling shutter: time from the exposure of the first row to that of the last, negative if "
+        "the last row is first; null: the calibration's (Kalibr's line_delay)",
+        unit="ms",
+        at_least=-100,
+        at_most=100,
+    )
     grid: GridSettings = field(default_factory=GridSettings)
     disparity: DisparitySettings = field(default_factory=DisparitySettings)
     consensus: ConsensusSettings = field(default_factory=ConsensusSettings)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from tests import calibration_forms as forms
 from tests.calibration_forms import SIZE, T_CAM0_IMU, T_CAM1_CAM0
 from vio.cameras.rig import Rig
 from vio.datasets.rigs.camera_info import CameraInfo, rig_from_camera_infos
+from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.rigs.source import stereo_pose_on_imu
 from vio.errors import CalibrationError
 
@@ -268,17 +270,28 @@ def test_scale_and_misalignment_of_an_imu_are_said_to_be_left_out(
     assert any("gyroscopes: M (up to" in n for n in vio.load_rig(tmp_path).notes) is is_said
 
 
-@pytest.mark.parametrize(("delay_s", "is_said"), [(-3e-5, True), (1e-6, False)])
-def test_a_rolling_shutter_is_said_to_be_left_out(
-    delay_s: float, is_said: bool, tmp_path: Path
+@pytest.mark.parametrize(("delay_s", "readout_s"), [(3e-5, 0.0216), (-3e-5, -0.0216), (1e-6, 0.0)])
+def test_a_rolling_shutter_is_read_and_written(
+    delay_s: float, readout_s: float, tmp_path: Path
 ) -> None:
     forms.kalibr(tmp_path)
     file = tmp_path / "camchain-imucam.yaml"
     chain = yaml.safe_load(file.read_text())
     chain["cam0"]["line_delay"] = delay_s
     file.write_text(yaml.safe_dump(chain))
-    notes = vio.load_rig(file).notes
-    assert any("rolling shutter of 21.6 ms from the first row" in n for n in notes) is is_said
+    rig = vio.load_rig(file)
+    said = f"rolling shutter of {1e3 * readout_s:.1f} ms from the first row"
+    assert any(said in note for note in rig.notes) is (readout_s != 0.0)
+    for camera in (rig.camera, rig.rectifier().camera, rig.left_alone().rectifier().camera):
+        assert camera.readout_s == pytest.approx(readout_s, rel=1e-12)
+    file.write_text(kalibr_text(rig))
+    assert vio.load_rig(file).readout_s == pytest.approx(readout_s, rel=1e-12)
+
+
+def test_a_readout_in_milliseconds_is_refused() -> None:
+    rig = forms.true_rig()
+    with pytest.raises(CalibrationError, match="readout time of the shutter is 20 s"):
+        replace(rig, readout_s=20.0)
 
 
 # --- matrices of NumPy and MATLAB

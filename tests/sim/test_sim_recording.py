@@ -402,3 +402,22 @@ def test_export_errors_name_the_missing_sensor(world: World, tmp_path: Path) -> 
 def test_predefined_scenes_are_clear_of_predefined_motions(seed: int) -> None:
     simulate(room(seed), small_rig(), hand_held(seed=seed))
     simulate(street(seed), kitti_like_rig(), car_loop(seed=seed), rate_hz=10.0)
+
+
+def test_rows_of_a_rolling_shutter_show_their_own_time(plain: Simulation) -> None:
+    readout_ms = 60.0
+    rolled = _recording(plain, replace(CLEAN, readout_ms=readout_ms))
+    still = _recording(plain, CLEAN)
+    height = plain.rig.cam0.height
+    frame = 12
+    time_ns = int(plain.taken_ns[frame])
+    image = rolled.images(frame)[0].astype(float)
+    at_once = still.images(frame)[0].astype(float)
+    for row in (6, height // 2, height - 7):
+        late = (row - 0.5 * (height - 1)) / height * readout_ms
+        then = still._sharp(0, time_ns + round(1e6 * late))[row]
+        off = float(np.median(np.abs(image[row] - then)))
+        off_at_once = float(np.median(np.abs(image[row] - at_once[row])))
+        assert off < 2.0
+        if abs(late) > 20:
+            assert off_at_once > 2 * off

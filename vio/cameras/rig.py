@@ -38,6 +38,7 @@ _BITS = 5  # of the parts of a pixel, 32, in which OpenCV's remap counts
 # two exposures.
 _DISPARITY_SIGMAS = 2**0.5
 _PIXEL_SIGMA_PX = 0.2  # of a tracked feature; what the filter learns on real images is 0.1 to 0.3
+_MAX_READOUT_S = 0.1  # of a rolling shutter: an image at 10 Hz
 # maps for cv2.remap: u and v, or those of `fixed_point`
 LookUp: TypeAlias = tuple[npt.NDArray[Any], npt.NDArray[Any]]
 
@@ -116,6 +117,23 @@ class Rectifier:
         row = np.where(inside, v, 0)
         column = np.where(inside, u, 0)
         return np.where(inside, depth_m[row, column], 0.0)
+
+    def rows(self, camera: int, pixels: FloatArray) -> FloatArray:
+        """Rows (N,) of the raw image, to a pixel, that show pixels (N, 2) of the rectified one.
+
+        Args:
+            camera: 0 left, 1 right.
+            pixels: u and v; those outside the image get the rows of its border.
+        """
+        if self.maps is None:
+            return pixels[:, 1]
+        whole = self.maps[camera][0]
+        height, width = whole.shape[:2]
+        u, v = np.rint(pixels).astype(np.int64).T
+        rows: FloatArray = np.asarray(
+            whole[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1), 1], dtype=np.float64
+        )
+        return rows
 
     def frame(
         self,
@@ -221,6 +239,8 @@ class Rig:
     residual_px: float = 0.0
     # levels of its depth images in a metre; None: not stated, or there are none
     depth_factor: float | None = None
+    # of a rolling shutter, from the exposure of the first row to that of the last
+    readout_s: float = 0.0
 
     def __post_init__(self) -> None:
         if (self.cam1 is None) != (self.T_cam1_cam0 is None):
@@ -235,6 +255,11 @@ class Rig:
         if not np.isfinite(self.time_offset_s):
             raise CalibrationError(
                 f"the time offset of camera and IMU is {self.time_offset_s}; give finite seconds"
+            )
+        if not abs(self.readout_s) <= _MAX_READOUT_S:
+            raise CalibrationError(
+                f"the readout time of the shutter is {self.readout_s:g} s; give seconds from the first "
+                "row to the last, such as 0.02"
             )
 
     @classmethod
@@ -379,12 +404,12 @@ class Rig:
             CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
         """
         if self.cam1 is None:
-            return _undistorted(self.cam0)[0]
+            return replace(_undistorted(self.cam0)[0], readout_s=self.readout_s)
         pair = rectified_pair(self.stereo)
         camera = (
             rectified_cameras(self.stereo, "auto").camera if pair is None else self._exact(pair)
         )
-        return replace(camera, residual_px=self.residual_px)
+        return replace(camera, residual_px=self.residual_px, readout_s=self.readout_s)
 
     @property
     def T_rect0_imu(self) -> FloatArray | None:
@@ -418,6 +443,7 @@ class Rig:
         """
         if self.cam1 is None:
             camera, maps = _undistorted(self.cam0)
+            camera = replace(camera, readout_s=self.readout_s)
             camera = camera if depth_noise is None else with_virtual_baseline(camera, depth_noise)
             if self.T_cam0_imu is None:
                 T = np.eye(4)
@@ -425,7 +451,7 @@ class Rig:
                 T = self.T_cam0_imu
             return Rectifier(self.cam0, camera, T, maps, interpolation, self.time_offset_s)
         made = rectifier_of(self.stereo, interpolation, projection)
-        camera = replace(made.camera, residual_px=self.residual_px)
+        camera = replace(made.camera, residual_px=self.residual_px, readout_s=self.readout_s)
         made = replace(made, camera=camera, time_offset_s=self.time_offset_s)
         if made.maps is not None:
             return made

@@ -140,6 +140,9 @@ class StereoCamera:
     kind: CameraKind = "stereo"
     # by how much pixels are known to be off still (rms): what no lens model of the rig holds
     residual_px: float = 0.0
+    # of a rolling shutter, from the exposure of the first row to that of the last, s; stamps are
+    # those of the middle row
+    readout_s: float = 0.0
 
     def __post_init__(self) -> None:
         values = (self.fu, self.fv, self.cu, self.cv, self.baseline_m)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,13 +18,14 @@ from vio.dataclass import dataclass
 from vio.errors import ConfigError
 from vio.filters import backend_class
 from vio.frontend import build_frontend
+from vio.frontend.rolling_shutter import RollingShutter
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.frame_pipeline import FramePipeline, RunParts
 from vio.live.imu_trial import ImuTrial
 from vio.live.processor import EventProcessor
 from vio.monitor.reading import ReadingCheck, pair_as_read, raw_pair
-from vio.protocols import Backend, Dataset, Detector, Frontend, Selector
+from vio.protocols import Backend, Dataset, Detector, Frontend, RectifyingDataset, Selector
 from vio.records import MotionSource, Observations, Recording, RunMotion, need_stereo
 from vio.selection.selectors import build_selector
 
@@ -237,6 +239,18 @@ def _frontend(source: Source, config: Config, parts: Parts, seen: StereoCamera) 
     return frontend
 
 
+def _shutter(camera: StereoCamera, config: Config, source: Source) -> RollingShutter | None:
+    """Return what moves the pixels of a rolling shutter; None: all rows are exposed at once."""
+    if config.frontend.readout_ms is not None:
+        camera = replace(camera, readout_s=1e-3 * config.frontend.readout_ms)
+    if not camera.readout_s:
+        return None
+    rectifier = source.rectifier
+    if isinstance(source.features, RectifyingDataset):
+        rectifier = source.features.rectifier
+    return RollingShutter(camera, rectifier)
+
+
 def _trial(source: Source, parts: Parts, backend: Backend, map: MapUse | None) -> ImuTrial | None:
     """Return what tries other readings of an IMU beside the run; None: it is used as given.
 
@@ -277,6 +291,7 @@ def build_processor(
             selector=parts.selector
             or build_selector(config.selector, whole_record=_record(features), camera=seen),
             backend=backend,
+            shutter=_shutter(seen, config, source),
         ),
         use_prior=config.frontend.prior,
         trial=_trial(source, parts, backend, map),

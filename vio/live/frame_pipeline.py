@@ -6,10 +6,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 from vio.dataclass import dataclass
 from vio.errors import DataError, DivergedError
 from vio.findings import INTEGRITIES
+from vio.frontend.rolling_shutter import RollingShutter
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.imu_trial import AS_GIVEN, ImuTrial, corrected, corrected_all
@@ -41,6 +43,7 @@ class RunParts:
     frontend: Frontend
     selector: Selector
     backend: Backend
+    shutter: RollingShutter | None = None  # None: all rows are exposed at once
 
 
 class FramePipeline:
@@ -64,6 +67,7 @@ class FramePipeline:
         self.monitor = RunMonitor(
             camera, T_cam0_body, imu=motion == "imu", extrinsics_known=extrinsics_known
         )
+        self._shutter = parts.shutter
         self._motion = motion
         self._use_prior = use_prior
         self._propagate_ms = 0.0  # since the last frame
@@ -163,7 +167,10 @@ class FramePipeline:
             return no_features(frame)
         checked = self.monitor.without_repeated_depth(frame)
         prior = expected.tracks if expected and self._use_prior else None
-        return self.frontend.process(checked, prior)
+        output = self.frontend.process(checked, prior)
+        if self._shutter is None:
+            return output
+        return replace(output, observations=self._shutter.corrected(output.observations))
 
     def usable(self, sample: MotionSample) -> MotionSample | None:
         """Return a sample as the back end takes it.

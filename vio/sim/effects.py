@@ -46,6 +46,12 @@ class SensorEffects:
     blur_exact: bool = setting(
         False, "render every sub-exposure; else blur one image along its exact optical flow"
     )
+    readout_ms: float = setting(
+        0.0,
+        "rolling shutter: time from the exposure of the first row to that of the last; stamps are "
+        "those of the middle row",
+        unit="ms",
+    )
     auto_exposure: bool = setting(
         False, "each camera's own exposure control sets shutter time and gain of each frame"
     )
@@ -87,6 +93,11 @@ class SensorEffects:
     def longest_shutter_ms(self) -> float:
         """The longest shutter time that any frame may have, ms."""
         return self.shutter_max_ms if self.auto_exposure else self.blur_exposure_ms
+
+    @property
+    def longest_exposure_ms(self) -> float:
+        """The longest time between the first light of a frame and its last, ms."""
+        return self.longest_shutter_ms + abs(self.readout_ms)
 
 
 CLEAN = SensorEffects(read_noise=0.0)
@@ -191,6 +202,18 @@ def average_exposures(
     for offset in offsets[1:]:
         total = total + render_at(time_ns + int(offset))
     return total / np.float32(len(offsets))
+
+
+def along_flow(image: Radiance, flow: FloatArray) -> Radiance:
+    """Return the image (H, W) that shows at each pixel what another one has a flow (H, W, 2) from
+    there, pixels.
+    """
+    height, width = image.shape
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    at = (flow + np.stack([u, v], axis=-1)).astype(np.float32)
+    # One map of both coordinates, which OpenCV's stubs do not know.
+    moved = cv2.remap(image, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    return np.asarray(moved, dtype=np.float32)
 
 
 def blur_along_flow(

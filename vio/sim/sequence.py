@@ -19,7 +19,7 @@ from vio.datasets.samples import imu_samples, in_time_order
 from vio.datasets.tables import read_imu_table, stamped_rows
 from vio.errors import DataError, SimulationError
 from vio.files.text import check_increasing
-from vio.geometry.distortion import StereoRig, rectified_pair
+from vio.geometry.distortion import CameraModel, StereoRig, rectified_pair
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.records import (
@@ -37,6 +37,7 @@ from vio.records import (
 from vio.sim.effects import (
     Exposure,
     SensorEffects,
+    along_flow,
     apply_effects,
     average_exposures,
     blur_along_flow,
@@ -201,9 +202,8 @@ def _frame_times(
         times = motion.start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     else:
         times = check_increasing(given, lambda k: f"frame time {k}")
-    half_shutter = (
-        int(effects.longest_shutter_ms * 0.5e6) + 1 if effects.longest_shutter_ms > 0 else 0
-    )
+    longest_ms = effects.longest_exposure_ms
+    half_shutter = int(longest_ms * 0.5e6) + 1 if longest_ms > 0 else 0
     offset = _offset_ns(faults)
     inside = (times - half_shutter >= motion.start_ns) & (times + half_shutter <= motion.end_ns)
     inside &= (times + offset >= motion.start_ns) & (times + offset <= motion.end_ns)
@@ -384,6 +384,8 @@ class SimulatedRecording:
             if shutter_ms > 0
             else self._sharp(camera, time_ns)
         )
+        if self.simulation.effects.readout_ms:
+            image = self._rolled(camera, time_ns, image)
         if self.simulation.effects.glare > 0 and self.simulation.world.lights:
             view = views(self.simulation, time_ns)[camera]
             image += glare(
@@ -412,6 +414,22 @@ class SimulatedRecording:
             taps = int(np.clip(2 * round(length / _BLUR.tap_spacing_px) + 1, 1, _BLUR.max_taps))
         return blur_along_flow(self._sharp(camera, time_ns), before, after, taps)
 
+    def _rolled(self, camera: int, time_ns: int, image: Radiance) -> Radiance:
+        """The image (H, W) with each row as its own time shows it, along the exact flow of a grid
+        of pixels, so that disocclusions are ignored.
+        """
+        view = views(self.simulation, time_ns)[camera]
+        grid = _grid_of(view.camera, _BLUR.flow_grid_px)
+        there = np.empty_like(grid)
+        height = view.camera.height
+        for row, of_row in enumerate(grid):
+            late = (of_row[0, 1] - 0.5 * (height - 1)) / height
+            at_ns = time_ns + round(late * self.simulation.effects.readout_ms * 1e6)
+            seen = views(self.simulation, at_ns)[camera]
+            there[row], _ = correspondence(self.simulation.world, seen, view, of_row)
+        shift = _between_nodes(there - grid, view.camera)
+        return along_flow(image, shift)
+
     def flow(
         self, camera: int, from_ns: int, to_ns: int, *, step_px: int = _BLUR.flow_grid_px
     ) -> FloatArray:
@@ -422,17 +440,9 @@ class SimulatedRecording:
         """
         view = views(self.simulation, from_ns)[camera]
         other = views(self.simulation, to_ns)[camera]
-        width = view.camera.width
-        height = view.camera.height
-        u = np.linspace(0, width - 1, width // step_px + 2)
-        v = np.linspace(0, height - 1, height // step_px + 2)
-        grid = np.stack(np.meshgrid(u, v), axis=-1)
+        grid = _grid_of(view.camera, step_px)
         there, _ = correspondence(self.simulation.world, view, other, grid.reshape(-1, 2))
-        # Bilinear between the nodes, of which the outer ones are at the image's outer pixels.
-        shift = there.reshape(grid.shape) - grid
-        down = _weights(len(v), height)
-        across = _weights(len(u), width)
-        return np.stack([down @ shift[..., k] @ across.T for k in (0, 1)], axis=-1)
+        return _between_nodes(there.reshape(grid.shape) - grid, view.camera)
 
     def depth(self, camera: int, time_ns: int) -> tuple[FloatArray, IntArray]:
         """Exact depth (H, W) in metres and the surface (H, W) seen by one camera at a true time."""
@@ -456,6 +466,20 @@ class SimulatedRecording:
             gyro,
             accel,
         )
+
+
+def _grid_of(camera: CameraModel, step_px: int) -> FloatArray:
+    """Pixels (R, C, 2) about a step apart, the outer ones at the image's outer pixels."""
+    u = np.linspace(0, camera.width - 1, camera.width // step_px + 2)
+    v = np.linspace(0, camera.height - 1, camera.height // step_px + 2)
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def _between_nodes(shift: FloatArray, camera: CameraModel) -> FloatArray:
+    """Bilinear (H, W, 2) between the nodes (R, C, 2) of `_grid_of`."""
+    down = _weights(shift.shape[0], camera.height)
+    across = _weights(shift.shape[1], camera.width)
+    return np.stack([down @ shift[..., k] @ across.T for k in (0, 1)], axis=-1)
 
 
 @functools.lru_cache(maxsize=8)

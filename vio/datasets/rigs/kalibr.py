@@ -85,7 +85,8 @@ def read_camchain(path: Path, *, alone: bool = False) -> Rig:
     T_cam0_imu = _imu_pose(blocks[0], where[0])
     T_cam1_cam0 = _stereo_pose(blocks[1], T_cam0_imu, path, notes) if "cam1" in names else None
     notes += _further_cameras(entries, names, path)
-    notes += _rolling_shutter(blocks[0], cameras[0].height, path)
+    readout_s, shutter_notes = _rolling_shutter(blocks[0], cameras[0].height, path)
+    notes += shutter_notes
     noise, imu_notes = _imu_beside(path)
     offset_s = _time_shift(blocks, where)
     residual_px = _residual(blocks[-1], where[-1])
@@ -104,6 +105,7 @@ def read_camchain(path: Path, *, alone: bool = False) -> Rig:
             tuple(notes),
             residual_px,
             factor,
+            readout_s,
         )
     return checked_rig(rig, path)
 
@@ -138,16 +140,18 @@ def _lone_camera(file: Path) -> object:
     return block if {"T_cam_imu", "T_imu_cam"} & block.keys() else None
 
 
-def _rolling_shutter(block: Mapping[str, Any], height: int, path: Path) -> list[str]:
-    """Return a note on a camera whose rows are exposed one after the other."""
-    read_s = abs(as_number(block.get("line_delay", 0.0))) * height
-    if not read_s > _ROLLING_S:
-        return []
-    return [
-        f"{path}: line_delay states a rolling shutter of {1e3 * read_s:.1f} ms from the first row to "
-        "the last, which is not modelled: turns make errors of that time; use a global shutter, or "
-        "move slowly"
-    ]
+def _rolling_shutter(block: Mapping[str, Any], height: int, path: Path) -> tuple[float, list[str]]:
+    """Return the time between the exposures of the first and the last row, and a note on it where
+    rows are exposed one after the other.
+    """
+    readout_s = as_number(block.get("line_delay", 0.0)) * height
+    if not abs(readout_s) > _ROLLING_S:
+        return 0.0, []
+    note = (
+        f"{path}: line_delay states a rolling shutter of {1e3 * readout_s:.1f} ms from the first "
+        "row to the last; features are moved to the time of the middle row"
+    )
+    return readout_s, [note]
 
 
 def _further_cameras(entries: Entries, names: Sequence[str], path: Path) -> list[str]:
@@ -353,6 +357,8 @@ def kalibr_text(rig: Rig) -> str:
         sheet |= _camera_sheet(camera)
         if T_cam_imu is not None:
             sheet["timeshift_cam_imu"] = float(rig.time_offset_s)
+        if rig.readout_s:
+            sheet["line_delay"] = float(rig.readout_s) / camera.height
         if name == "cam0" and rig.depth_factor is not None:
             sheet["depth_factor"] = float(rig.depth_factor)
         chain[name] = sheet

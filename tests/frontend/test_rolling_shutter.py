@@ -1,0 +1,187 @@
+"""Pixels of a rolling shutter, moved to the time of the middle row."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import vio
+from vio.cameras.rig import rectifier_of
+from vio.errors import ConfigError
+from vio.frontend.rolling_shutter import RollingShutter
+from vio.geometry.lie import FloatArray, se3_exp, transform_points
+from vio.geometry.stereo import StereoCamera, project
+from vio.records import Image, Observations, observations
+from vio.sim.effects import CLEAN
+from vio.sim.motion import hand_held
+from vio.sim.rigs import euroc_like_rig, euroc_rectified_rig
+from vio.sim.scenarios import scaled
+from vio.sim.sequence import SimulatedRecording, simulate
+from vio.sim.world import room
+
+_STEP_S = 0.05
+_READOUT_S = 0.02
+_CAMERA = StereoCamera(280.0, 280.0, 240.0, 155.0, 0.11, 480, 306, readout_s=_READOUT_S)
+_POINTS = np.random.default_rng(0).uniform([-3, -2, 2], [3, 2, 8], (300, 3))
+_TWIST = np.array([0.5, 0.2, 0.3, 0.4, -0.6, 0.5])  # of the points, m/s and rad/s
+_ACCELERATION = np.array([0.5, -1.0, 0.5, 1.0, 2.0, -1.0])
+
+
+def _at(camera: StereoCamera, points: FloatArray, time_s: float) -> FloatArray:
+    """Pixels (N, 4) of points at one time."""
+    T = se3_exp(_TWIST * time_s + 0.5 * _ACCELERATION * time_s**2)
+    return project(camera, transform_points(T, points))
+
+
+def _late_s(camera: StereoCamera, rows: FloatArray) -> FloatArray:
+    """Times of rows after the middle one."""
+    assert camera.height is not None
+    return (rows - 0.5 * (camera.height - 1)) * camera.readout_s / camera.height
+
+
+def _rolled(camera: StereoCamera, time_s: float) -> FloatArray:
+    """Pixels (N, 4) where a rolling shutter shows the points."""
+    z = _at(camera, _POINTS, time_s)
+    for _ in range(8):
+        late_s = _late_s(camera, z[:, 1])
+        z = np.array(
+            [_at(camera, p, time_s + late) for p, late in zip(_POINTS, late_s, strict=True)]
+        )
+    return z
+
+
+def _frame(index: int, z: FloatArray, has_right: bool = True) -> Observations:
+    ids = np.arange(len(z))
+    inside = (z >= 0).all(axis=1) & (z[:, 0] < 480) & (z[:, 1] < 306)
+    time_ns = round(1e9 * _STEP_S * index)
+    right = np.full(int(inside.sum()), has_right)
+    return observations(index, time_ns, ids[inside], z[inside], right)
+
+
+def _worst(seen: Observations, truth: FloatArray) -> float:
+    columns = 4 if seen.has_right.all() else 2
+    return float(np.abs(seen.z - truth[seen.ids])[:, :columns].max())
+
+
+@pytest.mark.parametrize("projection", ["pinhole", "cylinder"])
+@pytest.mark.parametrize("readout_s", [_READOUT_S, -_READOUT_S])
+def test_features_get_the_pixels_of_one_exposure(readout_s: float, projection: str) -> None:
+    camera = replace(_CAMERA, readout_s=readout_s, projection=projection)
+    shutter = RollingShutter(camera)
+    for k in range(6):
+        truth = _at(camera, _POINTS, _STEP_S * k)
+        seen = _frame(k, _rolled(camera, _STEP_S * k))
+        out = shutter.corrected(seen)
+        if k == 0:
+            # there is no velocity yet
+            assert np.abs(_late_s(camera, out.z[:, 1])).max() < 0.16 * _READOUT_S
+            assert 20 < len(out) < 0.5 * len(seen)
+        elif k > 1:
+            assert len(out) == len(seen) > 150
+            assert _worst(seen, truth) > 1.5
+            assert _worst(out, truth) < 0.12
+
+
+def test_features_without_depth_move_by_their_own_speed() -> None:
+    shutter = RollingShutter(_CAMERA)
+    shutter.corrected(_frame(0, _rolled(_CAMERA, 0.0), has_right=False))
+    seen = _frame(1, _rolled(_CAMERA, _STEP_S), has_right=False)
+    out = shutter.corrected(seen)
+    truth = _at(_CAMERA, _POINTS, _STEP_S)
+    assert len(out) > 150
+    before = set(_frame(0, _rolled(_CAMERA, 0.0)).ids)
+    moved = out.take(np.isin(out.ids, list(before)))
+    assert _worst(seen, truth) > 1.5
+    assert _worst(moved, truth) < 0.3  # the speed of half a step before
+    unmoved = seen.take(~np.isin(seen.ids, list(before)))
+    middle = np.abs(_late_s(_CAMERA, unmoved.z[:, 1])) < 0.15 * _READOUT_S
+    assert set(out.ids) == before & set(seen.ids) | set(unmoved.ids[middle])
+
+
+def test_a_new_feature_needs_its_depth() -> None:
+    shutter = RollingShutter(_CAMERA)
+    shutter.corrected(_frame(0, _rolled(_CAMERA, 0.0)))
+    seen = _frame(1, _rolled(_CAMERA, _STEP_S))
+    early = np.abs(_late_s(_CAMERA, seen.z[:, 1])) > 0.3 * _READOUT_S
+    renamed = replace(seen, ids=np.where(early, seen.ids + 1000, seen.ids))
+    alone = early & (np.arange(len(seen)) % 2 == 0)
+    renamed.has_right[alone] = False
+    out = shutter.corrected(renamed)
+    assert set(out.ids) == set(renamed.ids[~alone])
+
+
+def test_without_a_recent_velocity_the_middle_rows_are_left() -> None:
+    shutter = RollingShutter(_CAMERA)
+    for k in (0, 1):
+        out = shutter.corrected(_frame(k, _rolled(_CAMERA, _STEP_S * k)))
+    assert len(out) > 150
+    few = _frame(2, _rolled(_CAMERA, 2 * _STEP_S))
+    few = few.take(np.abs(few.z[:, 1] - 152.5) > 60.0).take(np.arange(5))
+    fresh = replace(few, ids=few.ids + 1000)
+    assert len(shutter.corrected(fresh)) == 5  # the velocity goes on
+    later = replace(fresh, ids=fresh.ids + 1000, time_ns=fresh.time_ns + 400_000_000)
+    assert len(shutter.corrected(later)) == 0
+
+
+def test_wrong_matches_do_not_bend_the_velocity() -> None:
+    shutter = RollingShutter(_CAMERA)
+    rng = np.random.default_rng(1)
+    for k in range(4):
+        z = _rolled(_CAMERA, _STEP_S * k)
+        wrong = rng.random(len(z)) < 0.2
+        z[wrong] += rng.uniform(-8, 8, (int(wrong.sum()), 1))
+        seen = _frame(k, z)
+        out = shutter.corrected(seen)
+    good = out.take(~wrong[out.ids])
+    assert len(good) > 100
+    assert _worst(good, _at(_CAMERA, _POINTS, _STEP_S * 3)) < 0.2
+
+
+def test_rows_of_the_raw_image_count() -> None:
+    rectifier = rectifier_of(euroc_like_rig())
+    camera = replace(rectifier.camera, readout_s=_READOUT_S)
+    assert camera.width is not None
+    assert camera.height is not None
+    pixels = np.array([[camera.width / 2, 30.0], [20.0, camera.height - 30.0]])
+    for number, raw in enumerate(rectifier.cameras):
+        rows = rectifier.rows(number, pixels)
+        assert np.abs(rows - pixels[:, 1]).max() > 5.0
+        assert ((rows >= 0) & (rows < raw.height)).all()
+    late_s = RollingShutter(camera, rectifier)._times.of(np.hstack([pixels, pixels]))
+    middle = 0.5 * (rectifier.cameras[0].height - 1)
+    expected = (rectifier.rows(0, pixels) - middle) * _READOUT_S / rectifier.cameras[0].height
+    np.testing.assert_allclose(late_s[:, 0], expected, atol=1e-12)
+
+
+def test_features_without_an_image_size_are_refused() -> None:
+    with pytest.raises(ConfigError, match="height of the images"):
+        RollingShutter(replace(_CAMERA, height=None))
+
+
+class _Kept(SimulatedRecording):
+    """A simulation whose images are rendered once."""
+
+    @functools.cache  # noqa: B019 - as long as the test
+    def images(self, index: int) -> tuple[Image, Image]:
+        return super().images(index)
+
+
+def test_a_run_with_the_readout_time_is_like_one_of_a_global_shutter() -> None:
+    rig = scaled(euroc_rectified_rig(), 320)
+    motion = hand_held(duration_s=2.5)
+    rolling = replace(CLEAN, readout_ms=20.0)
+    plan = simulate(room(1, texel_m=0.01), rig, motion, rate_hz=20.0, effects=rolling)
+    rolled = _Kept(plan)
+    at_once = _Kept(replace(plan, effects=CLEAN))
+    errors = []
+    for dataset, readout_ms in ((at_once, "null"), (rolled, "null"), (rolled, "20")):
+        config = vio.load_config(overrides=["motion=none", f"frontend.readout_ms={readout_ms}"])
+        result = vio.run(dataset, config)
+        score = vio.evaluate(result.trajectory, dataset.reference, T_cam0_imu=result.T_cam0_body)
+        errors.append(score.ate_m.rmse)
+    exposed_at_once, as_rolled, corrected = errors
+    assert as_rolled > 8 * exposed_at_once
+    assert corrected < as_rolled / 3
