@@ -288,6 +288,17 @@ def test_a_rolling_shutter_is_read_and_written(
     assert vio.load_rig(file).readout_s == pytest.approx(readout_s, rel=1e-12)
 
 
+@pytest.mark.parametrize(("rolls", "readout_s"), [(1, 0.025), (0, 0.0)])
+def test_the_rolling_shutter_of_vins_is_read(rolls: int, readout_s: float, tmp_path: Path) -> None:
+    file = forms.vins("radtan", tmp_path) / "euroc_stereo_imu_config.yaml"
+    file.write_text(file.read_text() + f"rolling_shutter: {rolls}\nrolling_shutter_tr: 0.025\n")
+    assert vio.load_rig(file).readout_s == readout_s
+    file.write_text(file.read_text().replace("0.025", "25.0"))
+    if rolls:
+        with pytest.raises(CalibrationError, match=r"euroc_stereo.*readout time .* 25 s"):
+            vio.load_rig(file)
+
+
 def test_a_readout_in_milliseconds_is_refused() -> None:
     rig = forms.true_rig()
     with pytest.raises(CalibrationError, match="readout time of the shutter is 20 s"):

@@ -4,6 +4,7 @@
 coordinates of the camera to the IMU, as do `extrinsicRotation` and `extrinsicTranslation`
 (VINS-Mono); `td` is added to the cameras' stamps to have the IMU's. Their `acc_n gyr_n acc_w gyr_w`
 are of a sample, not of a root of a hertz, and inflated on purpose: they are not taken.
+`rolling_shutter_tr` is the time from the first row to the last, where `rolling_shutter` is not 0.
 
 camodocal's lens models: PINHOLE (k1 k2 p1 p2), PINHOLE_FULL (rational), MEI (unified, mirror
 parameter xi), KANNALA_BRANDT (k2 to k5 on the powers 3 to 9 of the angle: OpenCV's fisheye).
@@ -13,6 +14,7 @@ Reference: VINS-Fusion's `parameters.cpp`, camodocal's camera models.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +63,19 @@ def read(source: Source) -> Rig:
         rig = _settings(source)
     else:
         rig = _alone(source)
-    return checked_rig(rig, source.where)
+    return checked_rig(_with_shutter(rig, source), source.where)
+
+
+def _with_shutter(rig: Rig, source: Source) -> Rig:
+    """Return a rig with the readout time of VINS-Mono's settings, whose stamps are of the middle
+    row, too.
+    """
+    entries = source.entries
+    if as_number(entries.get("rolling_shutter", 0)) == 0 or "rolling_shutter_tr" not in entries:
+        return rig
+    readout_s = numbers(entries, "rolling_shutter_tr", source.where, 1)[0]
+    with naming(source.path):
+        return replace(rig, readout_s=readout_s)
 
 
 def _alone(source: Source) -> Rig:
