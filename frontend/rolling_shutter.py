@@ -39,7 +39,8 @@ _RULES = _ShutterRules()
 _MIN_DEPTH_M: Tolerance[float] = 0.05  # of points moved by a velocity that is not fitted yet
 
 
-class _Seen(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class _Seen:
     """A frame as the camera showed it."""
 
     features: Observations
@@ -58,13 +59,15 @@ class _RowTimes:
     """When pixels were exposed, after the middle row of the raw image of their camera."""
 
     def __init__(self, camera: StereoCamera, rectifier: Rectifier | None) -> None:
-        self._rectifier = rectifier
         self._readout_s = camera.readout_s
-        if rectifier is None:
-            heights = (camera.height, camera.height)
-        else:
-            cameras = rectifier.cameras
-            heights = (cameras[0].height, cameras[-1].height)
+        self._rows: tuple[IntArray | None, ...] = (None, None)
+        heights = (camera.height, camera.height)
+        if rectifier is not None and len(rectifier.cameras) == 1:
+            self._rows = (rectifier.rows(0), rectifier.rows(0))
+            heights = (rectifier.cameras[0].height,) * 2
+        elif rectifier is not None:
+            self._rows = (rectifier.rows(0), rectifier.rows(1))
+            heights = (rectifier.rig.cam0.height, rectifier.rig.cam1.height)
         if None in heights:
             raise ConfigError(
                 "a rolling shutter needs the height of the images, which the recording does not "
@@ -75,11 +78,11 @@ class _RowTimes:
     def of(self, z: FloatArray) -> FloatArray:
         """Times (N, 2) of the left and the right pixels (N, 4), s."""
         late = np.empty((len(z), 2))
-        for camera, height in enumerate(self._heights):
-            pixels = z[:, 2 * camera : 2 * camera + 2]
-            rows = pixels[:, 1]
-            if self._rectifier is not None and camera < len(self._rectifier.cameras):
-                rows = self._rectifier.rows(camera, pixels)
+        for camera, (raw, height) in enumerate(zip(self._rows, self._heights, strict=True)):
+            rows = z[:, 2 * camera + 1]
+            if raw is not None:
+                u, v = np.rint(z[:, 2 * camera : 2 * camera + 2]).astype(np.int64).T
+                rows = raw[np.clip(v, 0, len(raw) - 1), np.clip(u, 0, raw.shape[1] - 1)]
             late[:, camera] = (rows - 0.5 * (height - 1)) * (self._readout_s / height)
         return late
 

@@ -29,7 +29,7 @@ from tests.filters.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from tests.replaced_rules import replaced
 from tests.runs.test_pipeline import FakeDrive
 from vio.cli import main
-from vio.config import Config
+from vio.config import Config, load_config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.observation_log import write_observation_log
 from vio.errors import DataError, EstimationError
@@ -182,8 +182,9 @@ def _assert_same(a: RunResult, b: RunResult) -> None:
         ),
         (lambda log: FakeDrive(), Config(), 14),
         (lambda log: _rendered(), Config(), 8),
+        (lambda log: _rendered(), load_config(overrides=["frontend.readout_ms=20"]), 8),
     ],
-    ids=["features and imu", "lag", "frame rate", "velocities", "images"],
+    ids=["features and imu", "lag", "frame rate", "velocities", "images", "rolling shutter"],
 )
 def test_a_run_goes_on_to_the_same_bits(
     flight_log: Path, tmp_path: Path, make: Callable[[Path], Dataset], config: Config, frames: int

@@ -31,7 +31,7 @@ from vio.geometry.rectify import (
     undistorted,
 )
 from vio.geometry.stereo import StereoCamera, one_camera
-from vio.records import Image, ImuDensities, StereoFrame
+from vio.records import Image, ImuDensities, IntArray, StereoFrame
 
 _BITS = 5  # of the parts of a pixel, 32, in which OpenCV's remap counts
 # Standard deviation of a virtual disparity over that of the pixels of a track, which are those of
@@ -118,22 +118,13 @@ class Rectifier:
         column = np.where(inside, u, 0)
         return np.where(inside, depth_m[row, column], 0.0)
 
-    def rows(self, camera: int, pixels: FloatArray) -> FloatArray:
-        """Rows (N,) of the raw image, to a pixel, that show pixels (N, 2) of the rectified one.
-
-        Args:
-            camera: 0 left, 1 right.
-            pixels: u and v; those outside the image get the rows of its border.
+    def rows(self, camera: int) -> IntArray | None:
+        """Rows (H, W) of a camera's raw image, to a pixel, that the pixels of its rectified one come
+        from; camera 0 is the left one. None: nothing is rectified.
         """
         if self.maps is None:
-            return pixels[:, 1]
-        whole = self.maps[camera][0]
-        height, width = whole.shape[:2]
-        u, v = np.rint(pixels).astype(np.int64).T
-        rows: FloatArray = np.asarray(
-            whole[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1), 1], dtype=np.float64
-        )
-        return rows
+            return None
+        return np.ascontiguousarray(self.maps[camera][0][..., 1])
 
     def frame(
         self,
