@@ -29,6 +29,7 @@ class _ShutterRules(NamedTuple):
     min_features: int = 12  # that two frames share, with depth
     steps: int = 5  # of Gauss-Newton
     least_px: float = 0.1  # scale of the residuals beyond which they count less, at least
+    least_elapsed: float = 0.1  # of the time between frames, between the rows of a wrong match
     held_s: float = 0.25  # for so long a velocity is taken to go on
     # of the rows, those about the middle one, in which features are used as they are seen where
     # there is no velocity
@@ -76,12 +77,13 @@ class _RowTimes:
         self._heights = tuple(int(height or 0) for height in heights)
 
     def of(self, z: FloatArray) -> FloatArray:
-        """Times (N, 2) of the left and the right pixels (N, 4), s."""
+        """Times (N, 2) of the left and the right pixels (N, 4), s; arbitrary where a pixel is."""
         late = np.empty((len(z), 2))
         for camera, (raw, height) in enumerate(zip(self._rows, self._heights, strict=True)):
             rows = z[:, 2 * camera + 1]
             if raw is not None:
-                u, v = np.rint(z[:, 2 * camera : 2 * camera + 2]).astype(np.int64).T
+                pixels = np.nan_to_num(z[:, 2 * camera : 2 * camera + 2])
+                u, v = np.rint(pixels).astype(np.int64).T
                 rows = raw[np.clip(v, 0, len(raw) - 1), np.clip(u, 0, raw.shape[1] - 1)]
             late[:, camera] = (rows - 0.5 * (height - 1)) * (self._readout_s / height)
         return late
@@ -124,6 +126,7 @@ class RollingShutter:
             rows, others = shared_rows(seen.ids, last.features.ids)
             elapsed_s = (seen.time_ns - last.features.time_ns) / NS_PER_S
             between_s = elapsed_s + late_s[rows, 0] - last.late_s[others, 0]
+            between_s = np.maximum(between_s, _RULES.least_elapsed * elapsed_s)
             self._learn(p, has_depth, rows, last.features, others, between_s)
             flow = (seen.z[rows] - last.features.z[others]) / between_s[:, None]
             both = seen.has_right[rows] & last.features.has_right[others]
@@ -140,8 +143,8 @@ class RollingShutter:
                 shift = (project(self._camera, there) - before)[:, columns]
                 z[has_depth, columns] = seen.z[has_depth, columns] + shift
             moved |= has_depth
-        moved |= np.abs(late_s).max(axis=1) <= 0.5 * _RULES.middle_share * self._readout_s
-        return replace(seen, z=z).take(moved & np.isfinite(z).all(axis=1))
+        moved |= np.abs(late_s[:, 0]) <= 0.5 * _RULES.middle_share * self._readout_s
+        return replace(seen, z=z).take(moved)
 
     def _learn(
         self,

@@ -102,6 +102,24 @@ def test_features_without_depth_move_by_their_own_speed() -> None:
     assert set(out.ids) == before & set(seen.ids) | set(unmoved.ids[middle])
 
 
+def test_right_pixels_that_do_not_count_may_be_anything() -> None:
+    frames = [_frame(k, _rolled(_CAMERA, _STEP_S * k)) for k in range(3)]
+    for alone in (np.nan, 1e9):
+        shutter = RollingShutter(_CAMERA)
+        outs = []
+        for seen in frames:
+            odd = seen.ids % 2 == 1
+            z = np.where(odd[:, None] & [False, False, True, True], alone, seen.z)
+            outs.append(shutter.corrected(replace(seen, z=z, has_right=~odd)))
+        out = outs[-1]
+        assert len(out) > 0.95 * len(frames[-1])
+        both = out.take(out.has_right)
+        assert _worst(both, _at(_CAMERA, _POINTS, 2 * _STEP_S)) < 0.15
+        left = out.take(~out.has_right)
+        truth = _at(_CAMERA, _POINTS, 2 * _STEP_S)[left.ids]
+        assert np.abs(left.z - truth)[:, :2].max() < 0.4
+
+
 def test_a_new_feature_needs_its_depth() -> None:
     shutter = RollingShutter(_CAMERA)
     shutter.corrected(_frame(0, _rolled(_CAMERA, 0.0)))
