@@ -420,6 +420,20 @@ def test_pairs_are_made_of_near_stamps() -> None:
     assert pairing.alone == 11
 
 
+@pytest.mark.parametrize("lost", [0, 1])
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_lost_image_costs_its_own_pair_only(lost: int, first: int) -> None:
+    """ROS's own synchronizer in Python pairs images of two frames from there on (F60)."""
+    pairing: Pairing[int] = Pairing()
+    pairs = []
+    for k in range(10):
+        for side in (first, 1 - first):
+            if (side, k) != (lost, 3):
+                pairs.append(pairing.add(side, 50_000_000 * k, k))
+    assert [pair for pair in pairs if pair] == [(50_000_000 * k, k, k) for k in range(10) if k != 3]
+    assert pairing.alone == 1
+
+
 def test_images_of_another_size_are_left_out_by_name(
     flight: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -11,7 +11,7 @@ import itertools
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -27,6 +27,7 @@ from tests.same_events import frames_of
 from vio.cameras.rig import Rig
 from vio.cli import main
 from vio.config import Config
+from vio.datasets.bags.sdk_stamps import sdk_stamps
 from vio.datasets.kitti import write_calibration
 from vio.datasets.rigs import load_rig
 from vio.datasets.rigs.kalibr import kalibr_text
@@ -365,8 +366,61 @@ def test_the_bag_of_realsenses_own_recorder_is_read_with_the_times_of_its_frames
     np.testing.assert_allclose(samples[3].accel, [0.0, 3.0, 1.0])
 
 
-def _record_realsense(path: Path) -> None:
-    """Record a software device of librealsense: two infrared imagers, gyro and accelerometer."""
+def test_images_of_a_realsense_are_stamped_at_the_middle_of_their_exposure(tmp_path: Path) -> None:
+    """Their stamps are those of the readout; live and from its own bag, with one exposure or a
+    changing one.
+    """
+    pytest.importorskip(
+        "pyrealsense2", reason="pyrealsense2 or libusb is not installed", exc_type=ImportError
+    )
+    path = tmp_path / "camera.db3"
+    _record_realsense(path, exposed_us=lambda k: 4000 * (k + 1))
+    expected = [1_000_000_000 + 50_000_000 * k - 2_000_000 * (k + 1) for k in range(5)]
+    source = open_source(f"realsense:{path}")
+    events = list(source.events())
+    source.close()
+    assert [event.time_ns for event in events if isinstance(event, SourceFrame)] == expected
+    assert vio.open_dataset(path).recording.frame_times_ns.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("metadata_us", "expected_ns"),
+    [
+        ({}, 0),
+        ({"frame_timestamp": 7_000_000}, 0),
+        ({"frame_timestamp": 7_000_000, "sensor_timestamp": 6_995_000}, 5_000_000),
+        ({"frame_timestamp": 7_000_000, "sensor_timestamp": 7_000_001}, 0),  # of two clocks
+        ({"frame_timestamp": 7_000_000, "sensor_timestamp": 5_000_000}, 0),
+    ],
+)
+def test_half_the_exposure_of_a_realsense_is_what_its_metadata_state(
+    metadata_us: dict[str, int], expected_ns: int
+) -> None:
+    source = object.__new__(RealSenseSource)
+    names = SimpleNamespace(frame_timestamp="frame_timestamp", sensor_timestamp="sensor_timestamp")
+    source._rs = SimpleNamespace(frame_metadata_value=names)
+    frame = SimpleNamespace(
+        supports_frame_metadata=metadata_us.__contains__,
+        get_frame_metadata=metadata_us.__getitem__,
+        get_profile=lambda: SimpleNamespace(fps=lambda: 30),
+    )
+    assert source._half_exposure_ns(frame) == expected_ns
+
+
+def test_metadata_of_a_realsense_bag_state_the_middle_of_the_exposure() -> None:
+    entries = b"Frame Timestamp=%d;Sensor Timestamp=%d;"
+    texts = [
+        (k, b"Frame number=1;timestamp=%d.000000;" % (1000 + 50 * k) + entries % pair)
+        for k, pair in enumerate([(70_000, 65_000), (120_000, 120_001), (170_000, 110_000)])
+    ]
+    texts.append((3, b"Frame number=1;timestamp=1150.000000;Sensor Timestamp=1;"))
+    assert (sdk_stamps(texts).stamp_ns / 10**6).tolist() == [995.0, 1050.0, 1100.0, 1150.0]
+
+
+def _record_realsense(path: Path, exposed_us: Callable[[int], int] | None = None) -> None:
+    """Record a software device of librealsense: two infrared imagers, gyro and accelerometer; with
+    metadata where the exposure of each frame is given.
+    """
     import pyrealsense2 as rs
 
     width, height = 160, 90
@@ -430,6 +484,10 @@ def _record_realsense(path: Path) -> None:
                 )
                 sample.domain, sample.frame_number = rs.timestamp_domain.hardware_clock, 10 * k + j
                 motion.on_motion_frame(sample)
+        if exposed_us is not None:
+            values, readout_us = rs.frame_metadata_value, 7_000_000 + 50_000 * k
+            stereo.set_metadata(values.frame_timestamp, readout_us)
+            stereo.set_metadata(values.sensor_timestamp, readout_us - exposed_us(k) // 2)
         for profile in videos:
             image = rs.software_video_frame()
             image.pixels = np.full(width * height, 20 * k + profile.stream_index(), dtype=np.uint8)
@@ -461,6 +519,7 @@ class _OakDevice:
     """
 
     CameraBoardSocket = SimpleNamespace(CAM_B="left", CAM_C="right")
+    CameraExposureOffset = SimpleNamespace(START="start", MIDDLE="middle", END="end")
     CameraModel = SimpleNamespace(Perspective=0, Fisheye=1, RadialDivision=4)
     IMUSensor = SimpleNamespace(ACCELEROMETER_RAW=0, GYROSCOPE_RAW=1)
     ImgFrame = SimpleNamespace(Type=SimpleNamespace(GRAY8="gray"))
@@ -548,9 +607,14 @@ def _oak_packet(k: int) -> Any:
 
 
 def _oak_image(after_us: int, value: int) -> Any:
-    stamp = timedelta(seconds=1, microseconds=after_us)
+    """Exposed for 4 ms times its value; the exposures of two cameras end together."""
+    end = timedelta(seconds=1, microseconds=after_us)
+    middle = end - timedelta(milliseconds=2 * value)
     image = np.full((400, 640), value, dtype=np.uint8)
-    return SimpleNamespace(getCvFrame=lambda: image, getTimestampDevice=lambda: stamp)
+    return SimpleNamespace(
+        getCvFrame=lambda: image,
+        getTimestampDevice=lambda offset="end": {"middle": middle, "end": end}[offset],
+    )
 
 
 def test_an_oak_gives_pairs_samples_and_calibration_in_metres(
@@ -567,8 +631,8 @@ def test_an_oak_gives_pairs_samples_and_calibration_in_metres(
     frames = [event for event in events if isinstance(event, SourceFrame)]
     samples = [event for event in events if isinstance(event, ImuSample)]
     assert [(f.time_ns, f.left[0, 0], f.right[0, 0]) for f in frames if f.right is not None] == [
-        (1_000_000_000, 1, 2),
-        (1_050_000_000, 2, 3),
+        (998_000_000, 1, 2),
+        (1_046_000_000, 2, 3),
     ]
     assert [s.time_ns for s in samples] == [1_000_000_000 + 5_000_000 * k for k in range(10)]
     rig = source.rig
@@ -653,6 +717,7 @@ def test_the_stand_in_has_only_names_of_depthai() -> None:
         (dai.MessageQueue, ("tryGetAll",)),
         (dai.IMUPacket, ("acceleroMeter", "gyroscope")),
         (dai.ImgFrame, ("getCvFrame", "getTimestampDevice")),
+        (dai.CameraExposureOffset, ("START", "MIDDLE", "END")),
         (dai.DeviceInfo, ("getDeviceId", "name")),
     ):
         assert [name for name in names if not hasattr(owner, name)] == []

@@ -44,7 +44,7 @@ _PAUSE_S: Capacity[float] = 0.002  # where nothing has come
 class OakSource:
     """A device, by its ID or the first one; see `LiveSource`.
 
-    Stamps are those of the device's exposures.
+    A frame's stamp is the middle of the left image's exposure.
     """
 
     image_size: tuple[int, int] | None = (_STREAMS.width, _STREAMS.height)
@@ -170,7 +170,8 @@ class OakSource:
         """
         imu = ImuInterpolation()
         last_s = time.monotonic()
-        pairing: Pairing[Image] = Pairing()
+        middle = self._dai.CameraExposureOffset.MIDDLE
+        pairing: Pairing[tuple[int, Image]] = Pairing()
         while True:
             packets = self._imu_packets()
             came = bool(packets)
@@ -186,9 +187,13 @@ class OakSource:
                 for message in images.tryGetAll():
                     came = True
                     image = np.asarray(message.getCvFrame(), dtype=np.uint8)
-                    pair = pairing.add(side, _ns(message.getTimestampDevice()), image)
+                    # what two cameras share is the end of their exposures, the plain stamp
+                    end_ns = _ns(message.getTimestampDevice())
+                    middle_ns = _ns(message.getTimestampDevice(middle))
+                    pair = pairing.add(side, end_ns, (middle_ns, image))
                     if pair is not None:
-                        yield SourceFrame(*pair)
+                        _, (time_ns, left), (_, right) = pair
+                        yield SourceFrame(time_ns, left, right)
             if came:
                 last_s = time.monotonic()
                 continue

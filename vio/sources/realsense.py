@@ -223,7 +223,7 @@ class RealSenseSource:
         rs = self._rs
         imu = ImuInterpolation()
         silent_s = 0.0
-        pairing: Pairing[Image] = Pairing()
+        pairing: Pairing[tuple[int, Image]] = Pairing()
         while True:
             try:
                 frame = self._come.get(timeout=_STREAMS.silent_s)
@@ -252,9 +252,25 @@ class RealSenseSource:
                 yield from take(time_ns, np.array([data.x, data.y, data.z]))
             else:
                 image = np.asarray(frame.as_video_frame().get_data()).copy()
-                pair = pairing.add(profile.stream_index() - 1, time_ns, image)
+                middle_ns = time_ns - self._half_exposure_ns(frame)
+                pair = pairing.add(profile.stream_index() - 1, time_ns, (middle_ns, image))
                 if pair is not None:
-                    yield SourceFrame(*pair)
+                    _, (left_ns, left), (_, right) = pair
+                    yield SourceFrame(left_ns, left, right)
+
+    def _half_exposure_ns(self, frame: Any) -> int:
+        """Return how long before an image's stamp, which is of its readout, the middle of its
+        exposure was; 0 where the driver passes no metadata.
+        """
+        values = self._rs.frame_metadata_value
+        instants = values.frame_timestamp, values.sensor_timestamp
+        if not all(frame.supports_frame_metadata(instant) for instant in instants):
+            return 0
+        readout_us, middle_us = (frame.get_frame_metadata(instant) for instant in instants)
+        half_us = int(readout_us - middle_us)
+        if 0 <= half_us <= 0.5e6 / frame.get_profile().fps():
+            return 1000 * half_us
+        return 0  # two clocks
 
     def close(self) -> None:
         """Stop the device."""
