@@ -177,8 +177,8 @@ CODES: dict[str, Code] = {
     ),
     "object-or-scene": Code(
         "unusable",
-        "points move apart, or an object hid the scene; nothing tells which",
-        "add an IMU, or mask what moves with the rig (frontend.klt.mask)",
+        "points move apart, or an object hid the scene",
+        "add an IMU, or mask what moves with the rig",
     ),
     "object-hides-scene": Code(
         "degraded", "an object hides nearly all of the scene; no feature is used", ""
@@ -198,6 +198,9 @@ CODES: dict[str, Code] = {
         "a frame shows another view than the one before",
         "add an IMU; keep recordings apart",
     ),
+    "tracks-disagree": Code(
+        "degraded", "tracks fit no common motion", "mask what moves with the rig"
+    ),
     "no-features": Code(
         "degraded",
         "no feature can be used; the pose is a prediction",
@@ -206,7 +209,7 @@ CODES: dict[str, Code] = {
     "features-refused": Code(
         "degraded",
         "many features contradict the others, and are refused",
-        "see the cause that the message names",
+        "see the message",
     ),
     "estimate-restarted": Code(
         "degraded", "the estimate diverged, and was started again from the last good pose", ""
@@ -248,8 +251,8 @@ CODES: dict[str, Code] = {
     ),
     "imu-not-used": Code(
         "degraded",
-        "frames were estimated again without the IMU, or with corrected units",
-        "correct the fault that is named before",
+        "frames were estimated again without the IMU, or corrected",
+        "correct the fault named before",
     ),
     "imu-in-doubt": Code(
         "degraded",

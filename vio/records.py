@@ -639,6 +639,9 @@ class UpdateReport:
     # by what the scale may be off, over it, as the motion sensor suggests, beside what is
     # considered
     scale_doubt: float = 0.0
+    # variance of the tracks' pixels in this frame, less what other poses explain, over the one
+    # learned before; 1 when consistent
+    misfit: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -122,6 +122,22 @@ def test_what_moves_slowly_is_no_blur() -> None:
     assert passed[:40].mean() < 0.1
 
 
+def test_the_misfit_is_known_beyond_the_noise_that_all_tracks_may_have() -> None:
+    """Residuals are four and eight times what is believed."""
+    tracks, rng = WindowTracks(CAMERA, SETTINGS), np.random.default_rng(4)
+    J = np.ones((80, 3, 4, 3))
+    J[:, :, 3] = 0.0
+    r = rng.normal(0.0, 4.0 * np.sqrt(tracks.variance * 6 / 9), (80, 3, 4))
+    r[:, :, 3] = 0.0
+    misfits = []
+    for factor in (1.0, 2.0):
+        tracks.gate(Residuals(factor * r, J, np.ones(80, dtype=np.bool_), np.ones(r.shape)))
+        assert tracks.common_noise == 4.0
+        misfits.append(tracks.misfit)
+    assert 8.0 < misfits[0] < 32.0
+    assert misfits[1] == pytest.approx(4.0 * misfits[0])
+
+
 @pytest.mark.parametrize(("off", "noise_px"), [(0.0, 0.1), (5e-4, 0.1), (5e-4, 0.15)])
 def test_a_pose_that_is_off_is_no_noise_of_all_tracks(off: float, noise_px: float) -> None:
     """A tenth of a pixel is believed; pixels have more, or the newest pose is off by half a

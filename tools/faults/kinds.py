@@ -36,6 +36,15 @@ from tools.faults.changes import (
     with_events,
 )
 from tools.faults.imu import ZERO, as_is, noisy_imu, plus, restamped, spikes, stuck_samples
+from tools.faults.views import (
+    Arm,
+    dirt,
+    drops,
+    exposure_steps,
+    losing_focus,
+    reflection,
+    robot_arm,
+)
 from vio.geometry.lie import FloatArray, so3_exp
 from vio.protocols import Dataset
 from vio.records import Event, Image, ImuSample, StereoFrame
@@ -121,8 +130,42 @@ def _covered(size: float, rng: np.random.Generator) -> Variant:
 
 
 def _torn(size: float, rng: np.random.Generator) -> Variant:
-    cameras = [(0,), (1,), (0, 1)][int(rng.integers(3))]
+    cameras = _cameras(rng)
     return pairs(torn_images, int(rng.integers(2, 6)), size, *cameras)
+
+
+def _cameras(rng: np.random.Generator) -> tuple[int, ...]:
+    """Left, right, or both."""
+    return [(0,), (1,), (0, 1)][int(rng.integers(3))]
+
+
+def _exposure(size: float, rng: np.random.Generator) -> Variant:
+    return pairs(exposure_steps, size, int(rng.integers(1, 6)), *_cameras(rng))
+
+
+def _dirt(size: float, rng: np.random.Generator) -> Variant:
+    radius = float(rng.uniform(0.01, 0.04))
+    return pairs(dirt, round(size), radius, *_cameras(rng), seed=int(rng.integers(1000)))
+
+
+def _drops(size: float, rng: np.random.Generator) -> Variant:
+    radius = float(rng.uniform(0.02, 0.07))
+    return pairs(drops, round(size), radius, *_cameras(rng), seed=int(rng.integers(1000)))
+
+
+def _arm(size: float, rng: np.random.Generator) -> Variant:
+    sway_px = float(rng.choice([0.0, 40.0]))
+    disparity_px = int(rng.integers(20, 60))
+    return pairs(robot_arm, Arm(size, sway_px, 75.0, disparity_px, seed=int(rng.integers(1000))))
+
+
+def _reflection(size: float, rng: np.random.Generator) -> Variant:
+    speed_px = float(rng.choice([0.0, 3.0]))
+    return pairs(reflection, size, speed_px, seed=int(rng.integers(1000)))
+
+
+def _unsharp(size: float, rng: np.random.Generator) -> Variant:
+    return pairs(losing_focus, int(rng.integers(2)), size, int(rng.integers(5, 30)))
 
 
 def _cut(size: float, rng: np.random.Generator) -> Variant:
@@ -318,6 +361,12 @@ KINDS: dict[str, Kind] = {
     "covered": Kind("cameras", "period", 0.7, 1.0, "of the image", _covered),
     "torn": Kind("cameras", "period", 0.2, 0.8, "of the rows", _torn),
     "cut": Kind("cameras", "onwards", 1, 1, "", _cut),
+    "exposure steps": Kind("cameras", "period", 1.0, 8.0, "stops", _exposure),
+    "dirt": Kind("cameras", "onwards", 10, 200, "grains", _dirt),
+    "drops": Kind("cameras", "onwards", 5, 50, "drops", _drops),
+    "arm": Kind("cameras", "period", 0.2, 0.6, "of the height", _arm),
+    "reflection": Kind("cameras", "period", 0.1, 0.6, "of its contrast", _reflection),
+    "focus": Kind("cameras", "period", 1.0, 6.0, "px of blur", _unsharp),
 }
 # Every second kind is kept aside: the two of a similar pair come to different halves.
 HALVES: dict[str, Half] = {

@@ -160,6 +160,7 @@ class FrameUpdate:
             innovation_ratio=innovation_ratio,
             gyro_jump_radps=jump_radps,
             scale_doubt=self._rig.scale_doubt(window),
+            misfit=self.fit.tracks.misfit,
         )
 
     def _take_shock(self, window: Window, predicted: _Predicted) -> bool:

@@ -139,6 +139,7 @@ class WindowTracks:
         self.variance = settings.pixel_sigma_px**2
         # variance of all tracks' pixels over it in the last frame, at least 1
         self.common_noise = 1.0
+        self.misfit = 1.0  # the same without its bound
 
     def choose(self, clones: int) -> IntArray:
         """Rows of the tracks that constrain the poses: two views or more, the most informative
@@ -342,7 +343,7 @@ class WindowTracks:
         squares = np.empty(len(at.r))
         dof = np.empty(len(at.r), dtype=np.int64)
         loops.square_tracks(at.r, at.z_D_p, self.variance, _TRACKS.max_dof, squares, dof)
-        self.common_noise = min(_misfit(squares, dof), _TRACKS.max_common_noise)
+        self._take_misfit(_misfit(squares, dof))
         limits = chi_square_table(self._settings.gate_probability)[dof] * self.common_noise
         passed: BoolArray = squares <= limits
         return passed, squares, dof
@@ -373,9 +374,12 @@ class WindowTracks:
         total = int(dof.sum())
         if total > spent:
             left = (1 - float(y @ y) / squares) / (1 - spent / total)
-            self.common_noise = min(
-                max(_misfit(nis, dof) * min(left, 1.0), 1.0), _TRACKS.max_common_noise
-            )
+            self._take_misfit(max(_misfit(nis, dof) * min(left, 1.0), 1.0))
+
+    def _take_misfit(self, misfit: float) -> None:
+        """Take how much larger a frame's variance is than the learned one."""
+        self.misfit = misfit
+        self.common_noise = min(misfit, _TRACKS.max_common_noise)
 
     def update_pixel_noise(self, squares: FloatArray, dof: IntArray, fitted: float) -> None:
         """Let the pixel noise follow the median of squared residuals over that of chi-square,

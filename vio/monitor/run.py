@@ -22,6 +22,7 @@ from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RefusalReport, RunHealth, is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import IntegrityMonitor, Mark
+from vio.monitor.misfit import TrackMisfit
 from vio.monitor.view_change import ViewChange
 from vio.records import (
     Estimate,
@@ -65,6 +66,7 @@ class RunMonitor:
         self._health = RunHealth()
         self._refusals = RefusalReport(imu=imu)
         self._views = ViewChange()
+        self._misfit = TrackMisfit()
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
         self._inertial: InertialCheck | None = None
@@ -373,6 +375,8 @@ class RunMonitor:
                 imu = imu and not self._contradiction.stands
             self._add(self._views.frame(self._seen, ratio, measured=measured, imu=imu))
             self._add(self._refusals.frame(self._seen, report, estimate))
+            if not measured:
+                self._add(self._misfit.frame(self._seen, report.misfit))
         self._scale_lines += self._health.scale(index, estimate)
         if self._inertial is not None:
             offset_s = self._inertial.clock_offset_s
