@@ -324,6 +324,21 @@ def test_a_lever_arm_in_centimetres_is_doubted_in_files_beside_the_cameras(
     assert "T_cam0_imu.txt: doubtful: the IMU is 6.9 m" in doubt
 
 
+def test_stamps_behind_names_of_several_words_pair_images(tmp_path: Path) -> None:
+    """Argoverse's `stereo_front_left_315966070522…`, a millisecond apart."""
+    folder = make_plain(
+        tmp_path,
+        folders=("stereo_front_left", "stereo_front_right"),
+        name=lambda side, k: (
+            f"stereo_front_{('left', 'right')[side]}_{STAMPS[k] + side * 1_000_000}.png"
+        ),
+        times=False,
+        imu=False,
+        reference=False,
+    )
+    assert open_dataset(folder).recording.frame_times_ns.tolist() == STAMPS
+
+
 def test_a_second_calibration_is_named(tmp_path: Path) -> None:
     folder = make_plain(tmp_path)
     chain = (folder / "camchain-imucam.yaml").read_text()
