@@ -236,7 +236,7 @@ def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
         ({"format": "else"}, "no observation log"),
         ({"version": 3}, "an observation log of version 3, this program reads up to 2; upgrade"),
         ({"z": None}, "the observation log lacks z"),
-        ({"z": np.zeros((2, 4), dtype=np.int64)}, "z of the observation log has type int64"),
+        ({"z": np.zeros((2, 4), dtype=np.complex128)}, "z of the observation log has type complex"),
         ({"z": np.zeros((3, 4))}, "inconsistent: 2 ids, but z is"),
         ({"offsets": [0, 2, 1]}, "the offsets do not split 2 rows into 2 frames"),
         ({"offsets": [0, 2, 2]}, "an id occurs twice in a frame"),

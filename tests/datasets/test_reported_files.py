@@ -293,6 +293,52 @@ def test_a_lever_arm_in_centimetres_is_doubted_beside_a_short_baseline(
         assert f"if it is the centimetre, it is {distance_m / 100:.4g} m" in doubts[0]
 
 
+def test_a_lever_arm_in_centimetres_is_doubted_in_files_beside_the_cameras(
+    tmp_path: Path,
+) -> None:
+    """ORB-SLAM's settings, whose IMU is read after the cameras, and T_cam0_imu.txt."""
+    T = np.eye(4)
+    T[0, 3] = 6.9
+    rig = vio.Rig.rectified(300.0, 300.0, 159.5, 119.5, 0.11, 320, 240)
+    text = "%YAML:1.0\n" + "".join(
+        f"Camera.{key}: {value}\n"
+        for key, value in zip(
+            ("fx", "fy", "cx", "cy", "bf", "width", "height"),
+            (300.0, 300.0, 159.5, 119.5, 33.0, 320, 240),
+            strict=True,
+        )
+    )
+    values = ", ".join(str(value) for value in np.linalg.inv(T).ravel())
+    text += f"Tbc: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n   data: [{values}]\n"
+    (tmp_path / "cam.yaml").write_text(text)
+    (doubt,) = [note for note in vio.load_rig(tmp_path / "cam.yaml").notes if "doubtful" in note]
+    assert "if it is the centimetre, it is 0.069 m" in doubt
+
+    folder = make_plain(tmp_path / "plain", frames=4)
+    assert not open_dataset(folder).recording.doubts
+    np.savetxt(folder / "T_cam0_imu.txt", T)
+    for file in folder.glob("*.yaml"):
+        file.unlink()
+    (folder / "camchain.yaml").write_text(kalibr_text(rig))
+    (doubt,) = open_dataset(folder).recording.doubts
+    assert "T_cam0_imu.txt: doubtful: the IMU is 6.9 m" in doubt
+
+
+def test_stamps_behind_names_of_several_words_pair_images(tmp_path: Path) -> None:
+    """Argoverse's `stereo_front_left_315966070522…`, a millisecond apart."""
+    folder = make_plain(
+        tmp_path,
+        folders=("stereo_front_left", "stereo_front_right"),
+        name=lambda side, k: (
+            f"stereo_front_{('left', 'right')[side]}_{STAMPS[k] + side * 1_000_000}.png"
+        ),
+        times=False,
+        imu=False,
+        reference=False,
+    )
+    assert open_dataset(folder).recording.frame_times_ns.tolist() == STAMPS
+
+
 def test_a_second_calibration_is_named(tmp_path: Path) -> None:
     folder = make_plain(tmp_path)
     chain = (folder / "camchain-imucam.yaml").read_text()

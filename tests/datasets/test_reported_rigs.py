@@ -20,6 +20,7 @@ from vio.cameras.rig import Rig
 from vio.datasets.rigs.camera_info import CameraInfo, rig_from_camera_infos
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.rigs.source import stereo_pose_on_imu
+from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError
 
 
@@ -241,6 +242,22 @@ def test_a_camera_matrix_that_is_nine_numbers_of_a_projection_is_read(tmp_path: 
     rig = vio.load_rig(tmp_path)
     assert (rig.cam0.fu, rig.cam0.fv, rig.cam0.cu, rig.cam0.cv) == (400, 410, 320, 240)
     assert rig.right[1][0, 3] == pytest.approx(-0.11)
+
+
+def test_settings_that_name_a_left_and_a_right_file_are_the_pair(tmp_path: Path) -> None:
+    """The cameras' files alone have no poses, though their names are those of a pair of ROS."""
+    expected = vio.load_rig(forms.vins("radtan", tmp_path))
+    for k, side in enumerate(("left", "right")):
+        (tmp_path / f"cam{k}_mei.yaml").rename(tmp_path / f"{side}.yaml")
+    settings = tmp_path / "euroc_stereo_imu_config.yaml"
+    text = settings.read_text().replace("cam0_mei", "left").replace("cam1_mei", "right")
+    settings.rename(tmp_path / "zed.yaml").write_text(text)
+    rig = vio.load_rig(tmp_path)
+    assert (rig.cam0, rig.cam1) == (expected.cam0, expected.cam1)
+    (tmp_path / "cam0").mkdir()
+    (tmp_path / "other.yaml").write_text("a: 1\n")
+    layout = Layout(tmp_path, tmp_path, tmp_path / "cam0", tmp_path / "cam0")
+    assert unused_note(layout, [tmp_path / "zed.yaml"]) == ["not used: other.yaml"]
 
 
 # --- what a calibration states and the estimate does not use

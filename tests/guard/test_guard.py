@@ -234,6 +234,29 @@ def test_finds_by_how_many_frames_right_images_are_late(delay: int) -> None:
     assert find_delay(shifted(delay), CAMERA) == delay
 
 
+@cache
+def long_flight() -> tuple[StereoFrame, ...]:
+    return tuple(stereo_frame(k, pose) for k, pose in enumerate(flight(28)))
+
+
+@pytest.mark.parametrize(("delay", "found"), [(5, 5), (-8, -8), (10, 10), (12, None)])
+def test_finds_right_images_that_are_up_to_ten_frames_late(delay: int, found: int | None) -> None:
+    """As of two videos that were begun one after the other."""
+    pairs = long_flight()
+    late = [
+        replace(pair, right=pairs[pair.index - delay].right)
+        for pair in pairs
+        if 0 <= pair.index - delay < len(pairs)
+    ]
+    assert find_delay(late, CAMERA) == found
+
+
+@pytest.mark.parametrize("moved", [4, -10])
+def test_a_right_camera_whose_rows_are_off_is_not_late(moved: int) -> None:
+    turned = [replace(pair, right=np.roll(pair.right, moved, axis=0)) for pair in long_flight()]
+    assert find_delay(turned, CAMERA) in (0, None)
+
+
 @pytest.mark.parametrize("delay", [-1, 1])
 def test_rows_that_were_found_before_hide_no_delay(delay: int) -> None:
     """Images of two times may match best at rows that are those of no camera."""

@@ -378,7 +378,8 @@ def _waits(flow_px: float, frames: int) -> bool:
 FIRST: dict[str, tuple[Says, float, float]] = {
     "pairs: counted frames": (lambda n: _decided({0: 90}, int(n)) is not None, 3, 4),
     "pairs: tests": (lambda n: _decided({0: 5}, int(n)) is not None, 40, 41),
-    "pairs: frames apart": (lambda n: _decided({-int(n): 90, 0: 5}, 12) != n, 3, 4),
+    "pairs: frames apart, soon": (lambda n: _decided({-int(n): 90, 0: 5}, 9) != n, 3, 4),
+    "pairs: frames apart": (lambda n: _decided({-int(n): 90, 0: 5}, 24) != n, 10, 11),
     "turned: few corners match": (lambda n: _evidence(int(n)) == "features", 47, 53),
     "turned: negative disparities": (lambda n: _evidence(90, int(n)) == "pairs", 23, 28),
     "turned: corners": (lambda n: _evidence(0, corners=int(n)) == "pairs", 29, 30),

@@ -181,6 +181,7 @@ def _gyro_says(
         count=count,
         S_cc=I3,
         S_gg=I3,
+        is_chance=False,
     )
     evidence = _evidence(gyro_fit=fit, clipped=clipped, last=last)
     return [f.fault for f in gyro.judge_gyro(evidence, 1.0) if words is None or words in f.message]
@@ -198,12 +199,26 @@ def _agrees(unexplained: float) -> bool:
 
 
 def _offset_is_named(offset_s: float = 0.1, as_stamped: float = 0.9) -> bool:
-    fit: Any = SimpleNamespace(offset_s=offset_s, unexplained=0.1, noise_radps=0.0)
+    fit: Any = SimpleNamespace(offset_s=offset_s, unexplained=0.1, noise_radps=0.0, is_chance=False)
     stamped = SimpleNamespace(unexplained=as_stamped)
     nothing: Any = None
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gyro_fit, "_at_offset", lambda *_: stamped)
         return judge_offset(fit, nothing, 10) is not None
+
+
+def _is_chance(offset_s: float = 1.0, stretch: float = 3.0) -> bool:
+    """Whether a map that stretches one axis is one by chance, at an offset of the clocks."""
+    gyro_rates = np.random.default_rng(0).normal(size=(200, 3))
+    camera = gyro_rates * [stretch, 1.0, 1.0]
+    S_cc, S_cg, S_gg = (
+        a.T @ b / 200 for a, b in ((camera, camera), (camera, gyro_rates), (gyro_rates,) * 2)
+    )
+    rest = (np.zeros((200, 3)), np.ones(200, np.bool_), np.ones(200))
+    fit = gyro_fit.GyroFit(
+        offset_s, S_cc, S_cg, S_gg, I3, np.zeros(3), 0.0, 0.0, 200, camera, gyro_rates, *rest
+    )
+    return fit.is_chance
 
 
 def _jitters(
@@ -246,6 +261,8 @@ GYRO: dict[str, tuple[Says, float, float]] = {
     "agrees": (lambda x: not _agrees(x), 0.17, 0.23),
     "offset": (lambda x: _offset_is_named(x), 0.017, 0.023),
     "offset: clearly": (lambda x: _offset_is_named(as_stamped=x), 0.18, 0.225),
+    "chance: offset": (lambda x: _is_chance(offset_s=x), 0.09, 0.11),
+    "chance: stretch": (lambda x: _is_chance(stretch=x), 1.4, 1.7),
     "stamps: intervals": (lambda n: _jitters(int(n)), 39, 40),
     "stamps: rate": (lambda x: _jitters(rate=x), 0.085, 0.115),
     "stamps: deviation": (lambda x: _jitters(sigma_s=x), 4.3e-4, 5.7e-4),

@@ -70,6 +70,15 @@ def test_a_scale_that_is_off_is_laid_on_baseline_or_focal_length_where_nothing_t
     assert "check the sensor (unit, axes, clock)" in line
 
 
+@pytest.mark.parametrize(("left", "named"), [(0.35, True), (0.45, False), (1.7, False)])
+def test_a_baseline_that_nearly_vanishes_beside_a_sensor_may_be_images_in_reverse_order(
+    left: float, named: bool
+) -> None:
+    scale = StereoScaleEstimate(np.array([np.log(left), 0.0]), np.diag([0.01**2, 0.0]))
+    (finding,) = RunHealth().scale(0, _estimate(0, stereo_scale=scale))
+    assert ("check the order of the images (against" in finding.message) == named
+
+
 @pytest.mark.parametrize(
     ("rows_px", "words"), [(4.3, "in a smooth pattern"), (26.0, "left and right are exchanged")]
 )

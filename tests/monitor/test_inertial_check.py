@@ -265,6 +265,44 @@ def test_readings_of_another_time_are_found_wrong(name: str, seed: int, seconds:
     assert "gyro disagrees" in _faults(_watch(it, samples=samples))
 
 
+@pytest.mark.parametrize("count", [60, 90])
+@pytest.mark.parametrize(("name", "seed"), [("room", 0), ("slow", 2)])
+def test_images_of_a_short_recording_in_reverse_order_are_named(
+    name: str, seed: int, count: int
+) -> None:
+    it = _recording(name, seed)
+    frames = it.frames[100 : 100 + count]
+    shown = [
+        replace(seen, frame_index=frame.frame_index, time_ns=frame.time_ns)
+        for seen, frame in zip(frames[::-1], frames, strict=True)
+    ]
+    (found,) = _watch(it, frames=shown)
+    assert "the order of the images reversed the gyro agrees" in found.message
+
+
+@pytest.mark.parametrize(("name", "seed"), [("room", 0), ("room", 1), ("slow", 2)])
+def test_images_in_reverse_order_are_no_clocks_apart(name: str, seed: int) -> None:
+    """Some offset and some linear map bring smooth rates together by chance."""
+    it = _recording(name, seed)
+    shown = [
+        replace(seen, frame_index=frame.frame_index, time_ns=frame.time_ns)
+        for seen, frame in zip(it.frames[::-1], it.frames, strict=True)
+    ]
+    (found,) = _watch(it, frames=shown)
+    assert found.fault == "gyro disagrees"
+    assert "in another order than that of their times" in found.message
+
+
+def test_readings_of_another_time_are_no_images_in_reverse_order() -> None:
+    it = _recording("room", 0)
+    later = [*it.samples[1900:], *it.samples[:1900]]
+    samples = [
+        replace(own, gyro=other.gyro, accel=other.accel)
+        for own, other in zip(it.samples, later, strict=True)
+    ]
+    assert not any("reversed" in f.message for f in _watch(it, samples=samples))
+
+
 # Units, signs, axes
 
 _CYCLE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])

@@ -36,9 +36,9 @@ def _found(
 
 
 def test_errors_that_patches_do_not_explain_are_named_from_where_their_tracks_began() -> None:
-    assert _found([1.0] * 20 + [1.6] * 10) == [(22, 13, False)]  # three of five frames
-    assert _found([1.0] * 20 + [1.4] * 10) == []
-    assert _found([1.0] * 20 + [1.6] * 2 + [1.0] * 10) == []
+    assert _found([1.0] * 20 + [1.65] * 10) == [(22, 13, False)]  # three of five frames
+    assert _found([1.0] * 20 + [1.55] * 10) == []
+    assert _found([1.0] * 20 + [1.65] * 2 + [1.0] * 10) == []
 
 
 def test_it_is_over_after_twenty_frames_that_agree() -> None:
@@ -61,7 +61,7 @@ def test_noise_that_sets_in_is_in_patches_as_in_tracks(noise: float) -> None:
 def test_sharper_images_excuse_nothing_and_accuse_nothing() -> None:
     sharp: list[float | None] = [0.05] * 20 + [0.02] * 20
     assert _found([1.0] * 40, sharp) == []
-    assert _found([1.0] * 20 + [1.6] * 20, sharp) == [(22, 13, False)]
+    assert _found([1.0] * 20 + [1.65] * 20, sharp) == [(22, 13, False)]
 
 
 def test_features_whose_patches_state_nothing_are_not_judged() -> None:

@@ -90,6 +90,38 @@ def test_a_frame_with_few_features_shows_no_view() -> None:
     assert len(check.frame(_frame(7, 2000, 30), None, measured=False, imu=False)) == 1
 
 
+def _said(numbers: list[int]) -> list[str]:
+    """What is said of images that show the views of these numbers, of which neighbours overlap."""
+    check = ViewChange()
+    found = []
+    last = None
+    first = 0
+    for k, number in enumerate(numbers):
+        if last is not None:
+            first += 10 if number == last + 1 else 3 * COUNT
+        last = number
+        found += check.frame(_frame(k, first), 1.0 if k < 8 else None, measured=False, imu=False)
+    return [finding.message for finding in found]
+
+
+@pytest.mark.parametrize("base", [0, 1])
+@pytest.mark.parametrize("count", [30, 60, 95])
+def test_images_numbered_in_the_order_of_text_are_named(base: int, count: int) -> None:
+    numbers = sorted(range(base, base + count), key=str)
+    lines = _said(numbers)
+    assert len(lines) >= 3
+    assert ["order of text (1, 10, 11, …, 2)" in line for line in lines[2:]] == [True] * (
+        len(lines) - 2
+    )
+    assert "as after a jolt" in lines[0]
+
+
+def test_jolts_are_no_order_of_text() -> None:
+    for jumps in ([10, 11, 20, 30], [9, 20, 31, 42], [10, 11, 12]):
+        numbers = [k + 50 * sum(k >= jump for jump in jumps) for k in range(50)]
+        assert not any("order of text" in line for line in _said(numbers))
+
+
 def _elsewhere(flight: Flight, k: int, later: int, noise: np.random.Generator) -> Observations:
     """What the flight sees some frames later, by other features, at the time of frame k."""
     seen = flight.observe(k + later, 0.3, noise)

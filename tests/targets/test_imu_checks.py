@@ -43,6 +43,10 @@ WRONG: dict[str, tuple[Callable[[ImuRecord], ImuRecord], str]] = {
     "gyro's order": (_gyro(lambda w: w @ CYCLIC), "accelerometer are not those of the gyro"),
     "accelerometer's order": (_accel(lambda a: a @ CYCLIC), r"its axes contain \[\+z \+x \+y\]"),
     "accelerometer's sign": (_accel(np.negative), "all readings have the wrong sign"),
+    "accelerometer first": (
+        lambda imu: replace(imu, gyro=imu.accel, accel=imu.gyro),
+        "gyro and accelerometer are exchanged: the gyro's readings come first",
+    ),
     "another recording": (_gyro(lambda w: 1e-3 * w[::-1]), "the gyro explains"),
     "microseconds": (
         lambda imu: replace(imu, times_ns=imu.times_ns // 1000),

@@ -492,6 +492,26 @@ def _filmed(views: list[View], frames: int = 40) -> Filmed:
     return Filmed(views, ((752, 480), (752, 480)), frames, None, ())
 
 
+@pytest.mark.parametrize(
+    ("degrees", "first", "named"), [(0.5, 6, True), (1.2, 9, True), (0.0, 6, False)]
+)
+def test_names_a_pair_that_was_moved_between_views(
+    degrees: float, first: int, named: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robust fit leaves the moved part out, and its halves agree."""
+    views = made_views(1, first)
+    turned = se3_from_parts(so3_exp([0, np.radians(degrees), 0]), np.zeros(3)) @ T_RIGHT_LEFT
+    monkeypatch.setattr("tests.board_views.T_RIGHT_LEFT", turned)
+    views += [replace(view, time_ns=10**10 + view.time_ns) for view in made_views(2, 12 - first)]
+    found = calibrate_cameras(_filmed(views), GRID, "radtan").verdict.findings
+    assert (
+        any("the cameras were moved against each other, or refocused" in text for text in found)
+        == named
+    )
+    if not named:
+        assert found == ()
+
+
 def test_names_pairs_that_are_not_of_one_moment() -> None:
     good = calibrate_cameras(_filmed(made_views(2, 12)), GRID, "radtan")
     assert good.verdict.findings == ()

@@ -206,7 +206,10 @@ def _unknown(path: Path) -> str:
     if path.suffix.lower() in images.SUFFIXES:
         return f"{path}: is one image; give a folder with left and right images and the calibration of the pair"
     if path.suffix.lower() in videos.SUFFIXES:
-        return f"{path}: is one video; give a folder with left.mp4, right.mp4 and the calibration of the pair"
+        return (
+            f"{path}: is one video; give a folder with left.mp4, right.mp4 and the calibration of the "
+            "pair, or with this video alone where it shows left and right side by side"
+        )
     if (unread := unread_files(path)) is not None:
         return unread
     if path.is_dir():

@@ -20,6 +20,7 @@ from vio.datasets.image_pairs import ImageSize
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.rigs.eth3d import EXTRINSICS, FOLDERS, is_eth3d, truth_of_left
 from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transform
+from vio.datasets.rigs.plausible import noting_imu_place
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import (
@@ -244,10 +245,11 @@ def _with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Pa
     path = layout.root / "T_cam0_imu.txt"
     transforms = layout.root / TRANSFORMS
     if rig.T_cam0_imu is None and not path.is_file() and transforms.is_file():
-        return replace(rig, T_cam0_imu=read_imu_transform(transforms)), [transforms]
+        rig = replace(rig, T_cam0_imu=read_imu_transform(transforms))
+        return noting_imu_place(rig, transforms), [transforms]
     if rig.T_cam0_imu is not None or not path.is_file():
         return rig, [path] if file.name == "calib.txt" else []
-    return replace(rig, T_cam0_imu=read_extrinsics(path)), [path]
+    return noting_imu_place(replace(rig, T_cam0_imu=read_extrinsics(path)), path), [path]
 
 
 def _read_motion(

@@ -37,10 +37,10 @@ _LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
 _TIMED = 100  # images, of which names that are times show it
 _LIST_FORM = "timestamp [ns], filename"
 _NUMBER = r"\d+(?:\.\d*)?(?:[eE][+-]?\d+)?"
-# `cam0_1403636579763555584`, `1403636579763555584_left`, `1700000001.33713`, `17000000013371ms`,
-# and `000012_1403636579763555584`, with the number of the frame
+# `cam0_1403636579763555584`, `stereo_front_left_315966070522`, `1403636579763555584_left`,
+# `1700000001.33713`, `17000000013371ms`, and `000012_1403636579763555584`, with the number of the frame
 _STAMP = re.compile(
-    r"(?:(?:[A-Za-z]+\d?|(?P<number>\d{1,7}))[_-])?"
+    r"(?:(?:[A-Za-z]+\d?(?:[_-][A-Za-z]+\d?)*|(?P<number>\d{1,7}))[_-])?"
     r"(?P<time>\d{10,19}|\d{1,10}\.\d{1,9})(?:_?(?P<unit>ns|us|ms|s))?"
     r"(?:[_-][A-Za-z]+\d?)?"
 )

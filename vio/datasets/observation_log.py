@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias, cast, get_args
 
@@ -20,6 +21,7 @@ import numpy.typing as npt
 
 from vio.cameras.rig import Rig
 from vio.datasets.common import begins_as_zip, read_npz, shape_text
+from vio.datasets.feature_forms import features_doubt, features_fault, without_placeholders
 from vio.datasets.features import FeatureDataset
 from vio.datasets.reader import Reader
 from vio.datasets.samples import MotionSamples
@@ -31,15 +33,18 @@ from vio.files.stamps import FRAME_PACE, SAMPLE_PACE
 from vio.files.text import check_increasing
 from vio.geometry.lie import FloatArray, checked_transform
 from vio.geometry.stereo import CameraKind, Projection, StereoCamera
+from vio.numerics.kinds import Tolerance
 from vio.records import (
     BodyFrame,
     FeatureTracks,
+    IntArray,
     Landmarks,
     MotionSample,
     Observations,
     Recording,
     RunMotion,
     Trajectory,
+    feature_tracks,
     joined_sigmas,
 )
 from vio.records import observations as frame_observations
@@ -84,6 +89,9 @@ _OPTIONAL: dict[str, tuple[str, int]] = {
     "landmark_covariance": ("f", 3),
 }
 _KINDS = {**_REQUIRED, **_DEFAULTED, **_OPTIONAL}
+_KIND_NAMES = {"f": "numbers", "i": "integers", "b": "true or false", "U": "text"}
+_EXACT: Tolerance[float] = 2.0**53  # whole numbers below it are exact as floats
+_COARSE_NS = 2**16  # times of which all are multiples of this power of 2 have lost digits
 _GROUPS = {  # keys that need others
     "reference_T_world_body": ("reference_body",),
     "landmark_ids": ("landmark_p_world", "landmark_covariance"),
@@ -206,15 +214,16 @@ def write_observations(
         camera: the rectified pair that the pixels belong to, or the rig whose `Rig.camera` that is.
         frame_times_ns: (F,) exposure times, integer nanoseconds, increasing.
         frames: for each frame ids (N,), pixels (N, 4) `[ul vl ur vr]`, rectified, and which rows
-            have a right match (N,) (None: all). An id belongs to one point, and occurs once in a
-            frame.
+            have a right match (N,) (None: all whose right pixels are numbers, and no placeholder
+            like -1 -1). An id belongs to one point, and occurs once in a frame.
         motion: samples of an IMU or velocities on the clock of the frames, in time order.
         T_cam0_imu: (4, 4) extrinsics of the motion sensor; None: those of a `Rig`.
         reference: ground truth, for the errors of a run.
 
     Raises:
         DataError: times or features are malformed, times are closer than those of any sensor (frame
-            numbers, milliseconds), or the file cannot be written.
+            numbers, milliseconds), pixels or ids are not what they must be as they tell themselves
+            (`vio.datasets.feature_forms`), or the file cannot be written.
         CalibrationError: the extrinsics are no rigid transform.
     """
     if isinstance(camera, Rig):
@@ -232,10 +241,16 @@ def write_observations(
     if fault := FRAME_PACE.fault(times_ns) or SAMPLE_PACE.fault(samples.times_ns):
         raise DataError(fault)
     seen = [frame_observations(k, int(times_ns[k]), *frame) for k, frame in enumerate(frames)]
+    tracks, note = without_placeholders(feature_tracks(dict(enumerate(seen)), len(seen)))
+    if fault := features_fault(camera, tracks):
+        raise DataError(f"features: {fault}")
     T = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
     recording = Recording(
         "features", Path(path), camera, T, times_ns, False, samples.kinds, reference
     )
+    if note is not None:
+        recording = replace(recording, notes=(note,))
+        seen = [tracks.at(k, int(times_ns[k])) for k in range(len(seen))]
     write_observation_log(Path(path), recording, seen, samples)
 
 
@@ -251,6 +266,7 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
         DataError: the file is no log, was written by a newer version, or is inconsistent.
     """
     arrays = read_npz(path, tuple(_KINDS))
+    is_foreign = "format" not in arrays
     arrays = _checked(arrays, path)
     frames = arrays["frame_indices"]
     offsets = arrays["offsets"]
@@ -262,6 +278,11 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
     tracks = FeatureTracks(
         dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"], sigma
     )
+    camera = _camera(arrays)
+    notes = tuple(str(note) for note in arrays["notes"])
+    if is_foreign:
+        tracks, found = _examined(tracks, camera, path)
+        notes = (*notes, *found)
     motion = MotionSamples[MotionSample](
         arrays["motion_times_ns"], arrays["motion_values"], arrays["motion_is_imu"]
     )
@@ -271,18 +292,33 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
     recording = Recording(
         kind="log",
         path=path,
-        camera=_camera(arrays),
+        camera=camera,
         T_cam0_imu=_extrinsics(arrays, path),
         frame_times_ns=times_ns,
         has_images=False,
         motion=motion.kinds,
         reference=_reference(arrays),
         landmarks_reference=_landmarks(arrays),
-        notes=tuple(str(note) for note in arrays["notes"]),
+        notes=notes,
         run_motion=run_motion,
         image_numbers=arrays.get("image_numbers"),
     )
     return FeatureDataset(recording, tracks, motion, frames)
+
+
+def _examined(
+    tracks: FeatureTracks, camera: StereoCamera, path: Path
+) -> tuple[FeatureTracks, tuple[str, ...]]:
+    """Return the features of another program without placeholders, and notes on them.
+
+    Raises:
+        DataError: they are not what they must be.
+    """
+    tracks, note = without_placeholders(tracks)
+    if fault := features_fault(camera, tracks):
+        raise DataError(f"{path}: {fault}")
+    found = (note, features_doubt(camera, tracks))
+    return tracks, tuple(f"{path}: {text}" for text in found if text is not None)
 
 
 def _checked(arrays: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.ndarray]:
@@ -297,6 +333,7 @@ def _checked(arrays: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.nd
             f"{path}: an observation log of version {version}, this program reads up to {VERSION}; "
             "upgrade stereo-vio"
         )
+    arrays = {key: _as_kind(array, _KINDS[key][0]) for key, array in arrays.items()}
     _check_arrays(arrays, path)
     whole = _with_defaults(arrays)
     if problem := _inconsistency(whole):
@@ -311,10 +348,28 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
             raise DataError(f"{path}: the observation log lacks {key}; write it again")
     for key, (kind, dimensions) in _KINDS.items():
         if key in arrays and (arrays[key].dtype.kind != kind or arrays[key].ndim != dimensions):
+            least = "one value" if dimensions == 0 else f"{dimensions}-D"
+            whole = ", whole nanoseconds" if key.endswith("_ns") else ""
             raise DataError(
                 f"{path}: {key} of the observation log has type {arrays[key].dtype}, "
-                f"{arrays[key].ndim}-D"
+                f"{arrays[key].ndim}-D; write {_KIND_NAMES[kind]}{whole}, {least}"
             )
+
+
+def _as_kind(array: np.ndarray, kind: str) -> np.ndarray:
+    """Return an array in another kind of numbers where that loses nothing: integers as floats, 0
+    and 1 as booleans, whole floats that are exact as integers.
+    """
+    if kind == "f" and array.dtype.kind in "iu":
+        return array.astype(np.float64)
+    if kind == "b" and array.dtype.kind in "iuf" and np.isin(array, (0, 1)).all():
+        return array.astype(np.bool_)
+    if kind == "i" and array.dtype.kind == "u" and (array <= np.iinfo(np.int64).max).all():
+        return array.astype(np.int64)
+    if kind == "i" and array.dtype.kind == "f" and (np.abs(array) < _EXACT).all():
+        whole = array.astype(np.int64)
+        return whole if (whole == array).all() else array
+    return array
 
 
 def _with_defaults(arrays: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
@@ -354,11 +409,18 @@ def _of_rows(arrays: Mapping[str, np.ndarray]) -> str | None:
         return f"{rows} ids, but z is {arrays['z'].shape} with {len(arrays['stale'])} stale marks"
     ends_fit = len(offsets) == len(frames) + 1 and offsets[0] == 0 and offsets[-1] == rows
     if not ends_fit or (np.diff(offsets) < 0).any():
-        return f"the offsets do not split {rows} rows into {len(frames)} frames"
+        ends = f", from {offsets[0]} to {offsets[-1]}" if len(offsets) else ""
+        return (
+            f"the offsets do not split {rows} rows into {len(frames)} frames ({len(offsets)} "
+            f"entries{ends}; {len(frames) + 1} are needed, none below the one before, from 0 to "
+            f"{rows})"
+        )
     in_frame = np.stack([arrays["ids"], np.repeat(np.arange(len(frames)), np.diff(offsets))])
     in_order = in_frame[:, np.lexsort(in_frame)]
-    if (in_order[:, 1:] == in_order[:, :-1]).all(axis=0).any():
-        return "an id occurs twice in a frame"
+    twice = np.flatnonzero((in_order[:, 1:] == in_order[:, :-1]).all(axis=0))
+    if len(twice):
+        feature, frame = in_order[:, twice[0]].tolist()
+        return f"an id occurs twice in a frame: {feature} in processed frame {frame}"
     if "sigma" in arrays and arrays["sigma"].shape != (rows, 3):
         return f"{rows} ids, but sigma is {shape_text(arrays['sigma'])}"
     return None
@@ -369,8 +431,15 @@ def _of_times(arrays: Mapping[str, np.ndarray]) -> str | None:
     frames = arrays["frame_indices"]
     times_ns = arrays["frame_times_ns"]
     samples = len(arrays["motion_times_ns"])
-    if (np.diff(times_ns) <= 0).any() or (np.diff(arrays["motion_times_ns"]) < 0).any():
-        return "a clock does not increase"
+    for key, least in (("frame_times_ns", 1), ("motion_times_ns", 0)):
+        late = np.flatnonzero(np.diff(arrays[key]) < least)
+        if len(late):
+            k = int(late[0])
+            before, after = arrays[key][k : k + 2].tolist()
+            return (
+                f"a clock does not increase: {key} has {after} (entry {k + 1}) after {before}"
+                f"{_lost_digits(arrays[key])}"
+            )
     if len(frames) and (
         frames[0] < 0 or frames[-1] >= len(times_ns) or (np.diff(frames) <= 0).any()
     ):
@@ -383,6 +452,15 @@ def _of_times(arrays: Mapping[str, np.ndarray]) -> str | None:
     if arrays["motion_values"].shape != (samples, 6) or len(arrays["motion_is_imu"]) != samples:
         return f"{samples} motion times, but values {arrays['motion_values'].shape}"
     return FRAME_PACE.fault(times_ns)
+
+
+def _lost_digits(times_ns: IntArray) -> str:
+    """What is said of times that repeat, and all are multiples of what 32-bit floats hold."""
+    step = int(np.bitwise_or.reduce(times_ns)) if len(times_ns) else 0
+    coarse = step and (step & -step) >= _COARSE_NS
+    if not coarse or (np.diff(times_ns) < 0).any():
+        return ""
+    return f", and all are multiples of {step & -step} ns: they went through 32-bit floats"
 
 
 def _of_camera(arrays: Mapping[str, np.ndarray]) -> str | None:

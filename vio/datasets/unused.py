@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ _SILENT = (
 )
 _PHOTOMETRIC = ("pcalib*.txt", "vignette*.png")  # of DSO and TUM-VI
 _NAMED = 12  # of a list
+_CAMERA_FILE = re.compile(r"^\s*cam\d_calib\s*:\s*[\"']?(?:[^\"'\n]*/)?([\w.-]+)", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,16 @@ def _kept(layout: Layout, used: Sequence[Path]) -> set[Path]:
     for path in used:  # the other files of a calibration that lies in several
         if path.suffix.lower() in (".yaml", ".yml", ".txt", ".xml"):
             kept |= {other.absolute() for other in path.parent.iterdir() if _belongs(other, path)}
+            kept |= {path.with_name(name).absolute() for name in _files_named_in(path)}
     return kept
+
+
+def _files_named_in(path: Path) -> list[str]:
+    """Return the files of cameras that settings name, as `cam0_calib: "left.yaml"`."""
+    try:
+        return _CAMERA_FILE.findall(path.read_text(encoding="utf-8", errors="ignore"))
+    except OSError:
+        return []
 
 
 def _not_read(layout: Layout, kept: set[Path]) -> list[str]:

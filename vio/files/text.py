@@ -157,7 +157,8 @@ def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> In
         repeated = int(np.count_nonzero(times[1:] == times[:-1]))
         remedy = (
             f"{repeated} of {len(times)} times repeat the one before, as times do that are written "
-            "with too few digits; write all their digits"
+            "with too few digits; write all their digits (or the time of each entry, where a batch of "
+            "them shares one)"
             if repeated > 1 + _ROUNDED * len(times)
             else _overflowed(int(times[k - 1] - times[k])) or "remove or reorder that entry"
         )

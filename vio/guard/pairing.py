@@ -15,7 +15,7 @@ belongs to a left image *before* (it is late) is marked, as its left image is go
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -36,7 +36,8 @@ class _PairingRules(NamedTuple):
     alike_frames: int = 2  # frames in a row after which the counts so far tell the same
     max_tests: int = 40  # frames in which the rig moves, after which the pairing counts as right
     min_points: int = 30  # corners in a frame
-    max_delay_frames: int = 3  # frames that images of a pair may be apart
+    near_frames: int = 3  # frames that images of a pair may be apart, at first …
+    far_frames: int = 10  # … and where that does not tell
     min_share: float = 0.4  # of the corners that match in the best pairing
     clear_factor: float = 1.3  # times as many as in both others
 
@@ -71,6 +72,44 @@ class _Halves:
         return self.probe.corners(self.left)
 
 
+class _Wider:
+    """Counts matches in all pairings of up to some frames."""
+
+    def __init__(self, reach: int) -> None:
+        self._reach = reach
+        self._points = 0
+        self._matched = dict.fromkeys(range(-reach, reach + 1), 0)
+        self._near: dict[int, IntArray] = {}  # (K,) on rows a little above and below
+
+    def delay(self, now: _Halves, before: Sequence[_Halves], probe: RowProbe) -> int | None:
+        """Count the matches of a frame, and return the delay that all tell, unless a difference of
+        all rows explains the pairs as they came as well.
+        """
+        if len(before) < self._reach:
+            return None
+        pairings = {0: (now, now)}
+        for delay in range(1, self._reach + 1):
+            earlier = before[-delay]
+            pairings[delay] = earlier, now
+            pairings[-delay] = now, earlier
+        points = min(len(left.corners) for left, _ in pairings.values())
+        if points < _PAIRING.min_points:
+            return None
+        self._points += points
+        for delay, (left, right) in pairings.items():
+            self._matched[delay] += probe.on_rows(left.left, right.right, left.corners)
+        told = told_delay(self._points, self._matched)
+        if told is None or told == 0:
+            return told
+        for delay in (0, told):
+            left, right = pairings[delay]
+            near = probe.near_rows(left.left, right.right, left.corners)
+            self._near[delay] = self._near.get(delay, 0) + near
+        if self._near[told].max() > self._near[0].max():
+            return told
+        return None
+
+
 class PairingCheck(ImageCheck):
     """Finds in the first frames that right images are some frames late or early."""
 
@@ -78,19 +117,13 @@ class PairingCheck(ImageCheck):
         super().__init__()
         self._probe = probe
         self._last: _Halves | None = None  # the last frame that was counted
-        self._recent = deque[_Halves](
-            maxlen=_PAIRING.max_delay_frames
-        )  # the frames before this one
+        self._recent = deque[_Halves](maxlen=_PAIRING.far_frames)  # the frames before this one
         self._told: list[int | None] = []  # by the counts so far, after each frame
         # of all frames: corners, and those that match in each pairing
         self._points = 0
         self._matched = {0: 0, 1: 0, -1: 0}
-        # likewise in all pairings, of the frames in which the pairs are not the best ones
-        self._far_points = 0
-        self._far_matched = dict.fromkeys(
-            range(-_PAIRING.max_delay_frames, _PAIRING.max_delay_frames + 1), 0
-        )
-        self._near: dict[int, IntArray] = {}  # likewise (K,) on rows a little above and below
+        # likewise of the frames in which the pairs are not the best ones
+        self._wider = tuple(_Wider(n) for n in (_PAIRING.near_frames, _PAIRING.far_frames))
         self._held = deque[Image]()  # right images that belong to later left ones
         self._begun_again = False
         self.delay: int | None = None  # None: not decided yet
@@ -172,30 +205,10 @@ class PairingCheck(ImageCheck):
         return len(corners) >= _PAIRING.min_points and matched >= few
 
     def _far_delay(self, now: _Halves) -> int | None:
-        """Count the matches of a frame in all pairings, and return the delay that they tell, unless
-        a difference of all rows explains the pairs as they came as well.
-        """
-        if len(self._recent) < _PAIRING.max_delay_frames:
-            return None
-        pairings = {0: (now, now)}
-        for delay in range(1, _PAIRING.max_delay_frames + 1):
-            before = self._recent[-delay]
-            pairings[delay] = before, now
-            pairings[-delay] = now, before
-        points = min(len(left.corners) for left, _ in pairings.values())
-        if points < _PAIRING.min_points:
-            return None
-        self._far_points += points
-        self._add(pairings, self._far_matched)
-        told = told_delay(self._far_points, self._far_matched)
-        if told is None or told == 0:
-            return told
-        for delay in (0, told):
-            left, right = pairings[delay]
-            near = self._probe.near_rows(left.left, right.right, left.corners)
-            self._near[delay] = self._near.get(delay, 0) + near
-        if self._near[told].max() > self._near[0].max():
-            return told
+        """Return the delay that the frames before tell, the nearest of them first."""
+        for counts in self._wider:
+            if (told := counts.delay(now, self._recent, self._probe)) is not None:
+                return told
         return None
 
     def _decide(self, index: int, delay: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import chain
 from typing import NamedTuple
 
@@ -69,6 +70,9 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     )
     if excess < limit:
         return []
+    if gyro_fit.is_chance:
+        enough = not brief or (evidence.last and gyro_fit.count >= _EXCESS.min_intervals)
+        return [_disagreement(gyro_fit)] if enough and not evidence.clipped else []
     if gyro_fit.fits(R):
         return _judge_scale(evidence, R)
     if not evidence.force_final:
@@ -136,15 +140,28 @@ def _contradiction(gyro_fit: GyroFit, R: FloatArray) -> str:
 def _disagreement(gyro_fit: GyroFit) -> InertialFinding:
     rate = np.degrees(float(np.sqrt(np.trace(gyro_fit.S_cc))))
     gyro_rms = float(np.sqrt(np.trace(gyro_fit.S_gg)))
+    by_gyro = (
+        f"the gyro explains {100 * (1 - gyro_fit.unexplained):.0f} % of it at the best clock offset "
+        f"within {FAR_OFFSETS_S[-1]:g} s"
+    )
+    if gyro_fit.is_chance:
+        by_gyro = f"by no rotation the gyro's rates agree with it, within {FAR_OFFSETS_S[-1]:g} s"
     return InertialFinding(
         "gyro disagrees",
-        f"the camera rotates at {rate:.1f} deg/s (RMS) and the gyro explains "
-        f"{100 * (1 - gyro_fit.unexplained):.0f} % "
-        f"of it at the best clock offset within {FAR_OFFSETS_S[-1]:g} s (the gyro's own RMS is "
+        f"the camera rotates at {rate:.1f} deg/s (RMS) and {by_gyro} (the gyro's own RMS is "
         f"{gyro_rms:.3g})",
         "the IMU's file may belong to another recording, the clocks may be further apart, the gyro "
-        "may be dead, or the "
-        "images may show something that moves with the camera",
+        "may be dead, or the images may be in another order than that of their times, or show "
+        "something that moves with the camera",
+    )
+
+
+def backwards(gyro_fit: GyroFit) -> InertialFinding:
+    """The finding of a gyro that disagrees with images whose order is reversed."""
+    return replace(
+        _disagreement(gyro_fit),
+        explanation="with the order of the images reversed the gyro agrees: they run backwards; "
+        "number them in the order of their exposures, or reverse the list of their times",
     )
 
 

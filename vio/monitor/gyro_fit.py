@@ -4,13 +4,14 @@ jitter of stamps.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from vio.dataclass import dataclass
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, nearest_rotation
 from vio.imu.findings import MAX_FOLLOWED_OFFSET_S, InertialFinding
 from vio.monitor.motion import Record
 from vio.numerics.robust import robust_sigma
@@ -118,6 +119,16 @@ class GyroFit:
         scale = self.scale(C)
         return scale > 0 and self.excess(C, scale) < self.tolerance
 
+    @property
+    def is_chance(self) -> bool:
+        """Whether the map fits at a clock offset of seconds and is neither a rotation nor a
+        reflection: of hundreds of offsets, one brings some map of nine numbers near smooth rates.
+        """
+        if abs(self.offset_s) <= MAX_FOLLOWED_OFFSET_S:
+            return False
+        nearest = (nearest_rotation(self.S_cg), -nearest_rotation(-self.S_cg))
+        return not any(self.fits(C) for C in nearest)
+
 
 def fit_gyro(record: Record, least: int, noise_radps: float | None = None) -> GyroFit | None:
     """Fit the camera's rates by the gyro's at the best clock offset; None: too little rotation.
@@ -143,6 +154,26 @@ def fit_gyro(record: Record, least: int, noise_radps: float | None = None) -> Gy
         if near is not None and near.unexplained <= best.unexplained:
             best = near
     return best if best.axes else None
+
+
+def fits_backwards(record: Record, least: int, R_cam0_imu: FloatArray) -> bool:
+    """Return whether the gyro, mapped by the given rotation (3, 3), explains the camera's rotation
+    once the order of the images is reversed.
+
+    Shown backwards, the images make the inverse motions, the last one first. Intervals that are not
+    those of a whole recording are at other times, where the gyro does not fit them.
+    """
+    both_ends = record.begin[0] + record.end[-1]
+    mirrored = replace(
+        record,
+        begin=both_ends - record.end[::-1],
+        end=both_ends - record.begin[::-1],
+        twists=-record.twists[::-1],
+    )
+    found = fit_gyro(mirrored, least)
+    if found is None or abs(found.offset_s) > MAX_FOLLOWED_OFFSET_S:
+        return False
+    return found.unexplained < AGREES and found.fits(R_cam0_imu)
 
 
 def _search_far(record: Record, near: GyroFit, least: int, noise: float) -> GyroFit:
@@ -227,6 +258,8 @@ def _traces(S: FloatArray) -> FloatArray:
 def judge_offset(gyro_fit: GyroFit, record: Record, least: int) -> InertialFinding | None:
     """Report a relevant clock offset, where the rotation determines it clearly."""
     if abs(gyro_fit.offset_s) < _RATES.named_offset_s or gyro_fit.unexplained > AGREES:
+        return None
+    if gyro_fit.is_chance:
         return None
     as_stamped = _at_offset(record, np.zeros(1), least, gyro_fit.noise_radps)
     if (

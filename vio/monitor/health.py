@@ -45,6 +45,8 @@ class _RigRules(NamedTuple):
     # No rig comes to this by a camera that turns in its mount (docs/notes/design_decisions.md,
     # swapped cameras).
     other_pair_px: float = 10.0
+    # of a baseline, which images in reverse order nearly take away: KITTI 06, 0039: -83, -81
+    backwards_percent: float = -60.0
     scale_off_percent: float = 1.0  # of baseline or focal length, both to be exceeded
     scale_sigmas: float = 3.0
 
@@ -232,15 +234,16 @@ class RunHealth:
             named = (
                 f"{name}, or the focal length," if len(found) == 1 and name == "baseline" else name
             )
+            order = ""
+            if name == "baseline" and percent < _RIG.backwards_percent:
+                order = "the order of the images (against a sensor they run backwards), "
             message = (
                 f"frame {index}: the {named} is {abs(percent):.1f} % "
                 f"{'longer' if percent > 0 else 'shorter'} than "
                 f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor "
-                "measures; check "
-                "the sensor (unit, axes, clock) and that images and calibration have one size (of "
-                "depth images, "
-                "dataset.depth_factor); then calibrate the cameras anew, or run with what "
-                "--save-calibration keeps"
+                f"measures; check {order}the sensor (unit, axes, clock) and that images and "
+                "calibration have one size (of depth images, dataset.depth_factor); then calibrate "
+                "the cameras anew, or run with what --save-calibration keeps"
             )
             figures = {"off_percent": percent, "sigma_percent": sigma}
             lines.append(Finding("scale-off", message, index, lasts=True, figures=figures))

@@ -31,6 +31,7 @@ from vio.monitor.gyro_fit import (
     FIRST_EVALUATION,
     GyroFit,
     fit_gyro,
+    fits_backwards,
     judge_offset,
     judge_stamps,
 )
@@ -306,12 +307,19 @@ class InertialCheck:
     ) -> list[InertialFinding]:
         """Judge with rotation, and decide whether the comparison may end."""
         from vio.monitor.accelerometer import resolve_size
-        from vio.monitor.gyro import judge_gyro
+        from vio.monitor.gyro import backwards, judge_gyro
 
         gyro_fit = evidence.gyro_fit
         size = resolve_size(size, evidence)
         rotation = judge_gyro(evidence, size.unit or 1.0)
-        found = self._judge_size_and_rates(size, record, gyro_fit, rotation)
+        offset = judge_offset(gyro_fit, record, _EVALUATIONS.min_intervals_at_end)
+        if (rotation or offset) and fits_backwards(
+            record, _EVALUATIONS.min_intervals_at_end, evidence.R_cam0_imu
+        ):
+            rotation = [backwards(gyro_fit)]
+            offset = None
+        found = [f for f in (size.finding, offset, judge_stamps(record)) if f is not None]
+        found += rotation or self._compare_rotations(record, gyro_fit)
         forces, measured = self._judge_force(evidence, size, rotation)
         found += forces
         # which of gyro and extrinsics is at fault may be open yet
@@ -323,16 +331,6 @@ class InertialCheck:
             found = self._judge_lever_arm(evidence, record, rates, enough=enough)
         self.done = enough and all(f.fault in self._suspected for f in found)
         return found
-
-    def _judge_size_and_rates(
-        self, size: Size, record: Record, gyro_fit: GyroFit, rotation: list[InertialFinding]
-    ) -> list[InertialFinding]:
-        """Return what size, stamps and rates show; rotations are compared where none of them is
-        found wrong.
-        """
-        offset = judge_offset(gyro_fit, record, _EVALUATIONS.min_intervals_at_end)
-        found = [f for f in (size.finding, offset, judge_stamps(record)) if f is not None]
-        return found + (rotation or self._compare_rotations(record, gyro_fit))
 
     def _judge_force(
         self, evidence: Evidence, size: Size, rotation: Sequence[InertialFinding]

@@ -34,11 +34,13 @@ class _ViewRules(NamedTuple):
     # The same where most are found again, and a motion sensor says how the rig moved: as long as the
     # record of MH_01 lacks half a second, 28 and 39; of healthy recordings single frames come to 4.
     apart_sigmas: float = 12.0
+    text_frames: int = 3  # whose view is another one, before their spacing tells
     # after one such frame, in which others belong to the same event
     apart_frames: int = 10
 
 
 _VIEW = _ViewRules()
+_TEXT_PERIOD = 11  # frames from a number that ends a ten to the next, in the order of text
 
 
 class ViewChange:
@@ -49,6 +51,7 @@ class ViewChange:
         self._frames = deque[Observations](maxlen=_VIEW.frames + 2)
         # frames since the last one that was apart from its prediction
         self._since_apart = _VIEW.apart_frames
+        self._lost: list[int] = []  # frames whose view was another one
 
     def frame(
         self, seen: Observations, innovation_ratio: float | None, *, measured: bool, imu: bool
@@ -76,7 +79,10 @@ class ViewChange:
         if usual < _VIEW.usual_share:
             return []
         if shares[-1] <= _VIEW.lost_share * usual:
-            return [_lost(seen.frame_index, len(frames[-2]), again[-1], measured=measured)]
+            index = seen.frame_index
+            self._lost.append(index)
+            as_text = _in_order_of_text(self._lost)
+            return [_lost(index, (len(frames[-2]), again[-1]), measured=measured, as_text=as_text)]
         is_apart = imu and _VIEW.apart_sigmas <= sigmas < np.inf
         if is_apart and self._since_apart > _VIEW.apart_frames:
             self._since_apart = 0
@@ -89,20 +95,36 @@ def _shown_again(before: Observations, after: Observations) -> int:
     return len(shared_rows(before.ids, after.ids)[0])
 
 
-def _lost(index: int, before: int, again: int, *, measured: bool) -> Finding:
-    """The finding on a frame that shows `again` of the features `before`."""
+def _in_order_of_text(lost: list[int]) -> bool:
+    """Whether frames whose view is another one come as those of images numbered in the order of
+    text do: 1, 10 to 19, 2, 20 to 29, with a jump before and after each number that ends a ten.
+    """
+    steps = {last - first for first in lost for last in lost}
+    return len(lost) >= _VIEW.text_frames and {1, _TEXT_PERIOD} <= steps
+
+
+def _lost(index: int, features: tuple[int, int], *, measured: bool, as_text: bool) -> Finding:
+    """The finding on a frame that shows some features of the frame before again.
+
+    `features`: those of the frame before, and those of them that it shows.
+    """
+    before, again = features
     figures = {"features_before": float(before), "features_again": float(again)}
     seen = (
         f"frame {index}: {again} of the {before} features of the frame before were found again, and "
         "not where they were expected: the view is another one"
     )
+    if as_text:
+        seen += (
+            f", as {_TEXT_PERIOD} frames earlier and in pairs, which images do that were numbered in "
+            "the order of text (1, 10, 11, …, 2); order them by their numbers"
+        )
     if measured:
         message = f"{seen}; the pose is a prediction by the motion sensor"
         return Finding("no-features", message, index, figures=figures)
-    message = (
-        f"{seen}, as after a jolt, a covered lens, or where parts of recordings are joined; how the "
-        "rig moved in between is not known"
-    )
+    if not as_text:
+        seen += ", as after a jolt, a covered lens, or where parts of recordings are joined"
+    message = f"{seen}; how the rig moved in between is not known"
     return Finding("view-changed", message, index, figures=figures)
 
 

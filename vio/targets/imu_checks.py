@@ -20,7 +20,7 @@ from vio.monitor.force_fit import Evidence, fit_force
 from vio.monitor.gyro import judge_gyro
 from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit, fit_gyro
 from vio.monitor.motion import Intervals, Record, record_of
-from vio.monitor.samples import Size, judge_size
+from vio.monitor.samples import Size, judge_exchange, judge_size
 from vio.numerics.robust import median
 from vio.records import S_PER_NS, ImuRecord, IntArray
 
@@ -71,6 +71,9 @@ def check_imu(
     for finding in judge_clocks(times_ns, imu.times_ns):
         if finding.fault == "clocks without overlap":
             raise _error(finding)
+    values = np.concatenate([imu.gyro, imu.accel], axis=1)
+    if (exchanged := judge_exchange(imu.times_ns, values)) is not None:
+        raise _error(exchanged)
     size = judge_size(imu.times_ns, imu.accel)
     intervals = _intervals(times_ns, T_cam0_board)
     gyro_fit = None
@@ -80,7 +83,6 @@ def check_imu(
         found = [size.finding]
     # With fewer, the adjustment says which rotation is missing.
     if len(intervals) >= _OFFSET.min_intervals:
-        values = np.concatenate([imu.gyro, imu.accel], axis=1)
         record = record_of(intervals, imu.times_ns, values)
         step_s = median(record.end - record.begin)
         gyro_fit = fit_gyro(record, _OFFSET.min_intervals, np.sqrt(2) * rotation_sigma_rad / step_s)

@@ -57,6 +57,9 @@ class _CheckRules(NamedTuple):
     # of halves that agree as stated; further apart, they inflate the sigmas
     chance_probability: float = 0.99
     unsynchronised_ratio: float = 1.5  # residual of the pair over that of the cameras alone
+    # views in which most corners of a camera are refused, before the pair is taken for moved
+    contradicting_views: int = 3
+    contradicting_share: float = 0.1  # of all views
     min_cell_share: float = 0.01  # of all corners, in a cell of the image
 
 
@@ -340,6 +343,7 @@ def judge(found: Adjusted, seen: Sightings, alone_sigma_px: Sequence[float]) -> 
     findings = [
         *_unsynchronised(found, alone_sigma_px),
         *_unequal(alone_sigma_px),
+        *_contradicting_views(found, seen),
         *coverage_findings(seen, cameras),
         *tilt_findings(found.at),
     ]
@@ -392,6 +396,28 @@ def _unequal(alone_sigma_px: Sequence[float]) -> list[str]:
         f"the {('left', 'right')[worst]} camera's corners are {ratio:.1f} times less accurate than "
         "the other one's: focus it, clean its lens, or shorten its exposure"
     ]
+
+
+def _contradicting_views(found: Adjusted, seen: Sightings) -> list[str]:
+    """Return the camera of a pair most of whose corners are refused in several views, which the
+    robust fit leaves out like single wrong corners.
+    """
+    if seen.cameras < 2:
+        return []
+    out: list[str] = []
+    for c, name in enumerate(("left", "right")):
+        rows = seen.camera == c
+        shown = np.bincount(seen.view[rows], minlength=seen.views)
+        refused = np.bincount(seen.view[rows & ~found.used], minlength=seen.views)
+        views = np.flatnonzero(2 * refused > shown)
+        if len(views) >= max(_CHECKS.contradicting_views, _CHECKS.contradicting_share * seen.views):
+            out.append(
+                f"most corners of the {name} camera contradict the others in {len(views)} of "
+                f"{seen.views} views (from view {views[0] + 1} to {views[-1] + 1}) and are left out: "
+                "the cameras were moved against each other, or refocused, between these views and the "
+                "others; fasten them and record again, or calibrate either part alone"
+            )
+    return out
 
 
 def corners_by_part(uv: FloatArray, width: int, height: int) -> FloatArray:

@@ -128,10 +128,11 @@ def find_calibration(folder: Path) -> Path | None:
     """Return the calibration file in a folder; None where there is none.
 
     Usual names go first; else the content of the files there decides, that of a pair before that
-    of one camera.
+    of one camera, as of settings that name a left.yaml.
     """
     if (named := named_calibration(folder)) is not None:
-        return named
+        is_part = side_word(named.stem) == "left" and _is_part_of_settings(named)
+        return _by_content(folder) if is_part else named
     pair = pair_of_files(folder)
     return _by_content(folder) if pair is None else pair[0]
 
@@ -150,6 +151,11 @@ def _is_known(file: Path) -> bool:
     except DataError:
         return False
     return any(fits(entries) for fits, _ in _FORMATS)
+
+
+def _is_part_of_settings(file: Path) -> bool:
+    """Whether a file is a camera's of camodocal, which has no pose: settings beside it have."""
+    return _is_known(file) and "model_type" in _entries(file)
 
 
 def _is_of_one_camera(file: Path) -> bool:

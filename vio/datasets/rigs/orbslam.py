@@ -18,7 +18,7 @@ import numpy as np
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.opencv import coefficients_of, rig_from_opencv
-from vio.datasets.rigs.plausible import checked_rig
+from vio.datasets.rigs.plausible import checked_rig, noting_imu_place
 from vio.datasets.rigs.source import Size, Source
 from vio.datasets.yaml_files import Entries, as_number, matrix, numbers, tool_lens
 from vio.errors import CalibrationError
@@ -48,7 +48,7 @@ def read(source: Source) -> Rig:
     pose = _transform(entries, _POSES_OF_CAMERA, source.where)
     T_cam0_imu = None if pose is None else se3_inverse(pose)
     noise = None if pose is None else _noise(entries, source.where)
-    return replace(rig, T_cam0_imu=T_cam0_imu, imu_noise=noise)
+    return noting_imu_place(replace(rig, T_cam0_imu=T_cam0_imu, imu_noise=noise), source.where)
 
 
 def _cameras(source: Source) -> Rig:

@@ -62,7 +62,8 @@ def checked_rig(rig: Rig, where: Path | str, *, size_stated: bool = True) -> Rig
     """
     for camera in rig.cameras:
         check_camera(camera, where)
-    doubts = [_distance_doubt(rig, where)]
+    rig = noting_imu_place(rig, where)
+    doubts: list[str | None] = []
     if not size_stated:
         doubts += [_size_doubt(rig.cam0, where), _aspect_doubt(rig.cam0, where)]
     else:
@@ -82,6 +83,15 @@ def _check_focal_length(camera: CameraModel, where: Path | str) -> None:
         f"degrees of images {camera.width} pixels wide; focal lengths and principal points must be "
         "pixels, not millimetres or shares of the width"
     )
+
+
+def noting_imu_place(rig: Rig, where: Path | str) -> Rig:
+    """Return a rig with a note where its IMU is farther from the camera than on any rig.
+
+    `where`: the file that states its pose.
+    """
+    doubt = _distance_doubt(rig, where)
+    return rig if doubt is None else rig.noting(doubt)
 
 
 def _distance_doubt(rig: Rig, where: Path | str) -> str | None:

@@ -1,0 +1,319 @@
+"""What the features of another program show of how they were written: which columns hold what,
+where pixels count from, and whether an id is a point.
+
+A tracker's own numbers tell more than their types. Left and right rows agree in a rectified pair,
+so an order of columns in which they do is known from the others; a point moves with those around
+it, so an id that does not is none. What cannot be meant otherwise is refused with what to write;
+right pixels that are placeholders are taken as not measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.records import DOUBT, BoolArray, FeatureTracks, IntArray
+
+
+class _Rules(NamedTuple):
+    """From where on features are not those of a rectified pair in pixels."""
+
+    fewest: int = 20  # rows that tell
+    most: float = 0.8  # share of rows that are "most"
+    few: float = 0.1  # share of rows that may lie outside of the image
+    near_px: float = 2.0  # rows of left and right that agree; how far outside of an image is in it
+    unrelated: float = 0.5  # correlation below which left and right pixels are not of one point
+    normalised_max: float = 10.0  # no image has all its pixels nearer to its corner …
+    least_focal: float = 100.0  # … where the focal length is this long, in pixels
+    unlike: float = 0.05  # share by which the focal lengths of a rectified pair never differ
+    again: float = 0.01  # share of the features whose ids the next frame has
+    scatter: float = 0.6  # of a point's motion beside that of two of any ids
+    beyond: float = 3.0  # times the principal point, where no image of one size ends
+    filled: float = 0.8  # share of the upper left quarter that features of half the size reach
+
+
+_RULES = _Rules()
+_COLUMNS = ("ul", "vl", "ur", "vr")
+# Other orders of the columns of z, by which of them the four are.
+_ORDERS: dict[str, tuple[int, int, int, int]] = {
+    "ul ur vl vr": (0, 2, 1, 3),
+    "vl ul vr ur": (1, 0, 3, 2),
+    "vr ur vl ul": (3, 2, 1, 0),
+    "ur vr ul vl": (2, 3, 0, 1),
+}
+_NEGATIVE = "ur vr ul vl"  # what also explains negative disparities: u that counts from the right
+
+
+def without_placeholders(tracks: FeatureTracks) -> tuple[FeatureTracks, str | None]:
+    """Return tracks whose right pixels that stand for "not found" have no `has_right`, and what was
+    taken so.
+
+    These are pixels that are no numbers, and pairs at or below zero that several rows share to the
+    last bit, as -1 -1.
+    """
+    right = tracks.z[:, 2:]
+    empty = np.isnan(right).any(axis=1)
+    low = tracks.has_right & (right <= 0).all(axis=1)
+    values, place, counts = np.unique(right[low], axis=0, return_inverse=True, return_counts=True)
+    shared = np.zeros(len(right), dtype=np.bool_)
+    shared[low] = (counts > 1)[place.reshape(-1)]
+    held = tracks.has_right & (empty | shared)
+    if not held.any():
+        return tracks, None
+    kinds = ["no numbers"] if (tracks.has_right & empty).any() else []
+    kinds += [f"{u:g} {v:g}" for u, v in values[counts > 1].tolist()]
+    note = (
+        f"ur vr are {' or '.join(kinds[:3])} in {int(held.sum())} rows that has_right marks as "
+        "measured; these are taken as seen by the left camera alone"
+    )
+    return replace(tracks, has_right=tracks.has_right & ~held), note
+
+
+def features_fault(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
+    """Return why features are not rectified pixels `[ul vl ur vr]` of points with ids, and what to
+    write instead; None: they may be.
+    """
+    needed = tracks.z.copy()
+    needed[~tracks.has_right, 2:] = 0.0
+    lost = np.flatnonzero(~np.isfinite(needed).all(axis=1))
+    if len(lost):
+        row = int(lost[0])
+        frame = int(np.searchsorted(tracks.offsets, row, side="right")) - 1
+        return (
+            f"row {row} (processed frame {frame}, id {int(tracks.ids[row])}) is at the pixels "
+            f"{tracks.z[row].tolist()}; leave it out"
+        )
+    if len(tracks.ids) < _RULES.fewest:
+        return None
+    checks: tuple[Callable[[StereoCamera, FeatureTracks], str | None], ...] = (
+        _of_intrinsics,
+        _of_units,
+        _of_columns,
+        _of_places,
+        _of_ids,
+    )
+    return next((fault for check in checks if (fault := check(camera, tracks)) is not None), None)
+
+
+def features_doubt(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
+    """Return a note where pixels and principal point look like those of images of two sizes: all
+    features fill the upper left quarter alone, or go far beyond an image of no stated size.
+    """
+    if len(tracks.ids) < _RULES.fewest or camera.projection != "pinhole":
+        return None
+    half = np.array([camera.cu, camera.cv])
+    if camera.width is not None and camera.height is not None:
+        half = 0.5 * np.array([camera.width, camera.height])
+    farthest = tracks.z[:, :2].max(axis=0)
+    reached = f"({farthest[0]:.0f}, {farthest[1]:.0f})"
+    if (farthest > _RULES.beyond * half).all():
+        return (
+            f"{DOUBT}features lie up to {reached}, and the principal point is ({half[0]:.0f}, "
+            f"{half[1]:.0f}); intrinsics and pixels must be of images of one size"
+        )
+    is_quarter = (farthest <= (1 + _RULES.unlike) * half) & (farthest >= _RULES.filled * half)
+    if not is_quarter.all():
+        return None
+    return (
+        f"{DOUBT}all features lie in the upper left quarter of the image, up to {reached}; if they "
+        "are pixels of images of half the size, halve fu fv cu cv, too"
+    )
+
+
+def _of_intrinsics(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
+    del tracks
+    if camera.projection != "pinhole" or not _differs(camera.fu, camera.fv):
+        return None
+    if _differs(camera.fu, camera.cu):
+        return None
+    return (
+        f"intrinsics have the focal lengths {camera.fu:g} and {camera.fv:g}, and the principal point "
+        f"({camera.cu:g}, {camera.cv:g}), as if their order were fu cu fv cv; write fu fv cu cv and "
+        "the baseline"
+    )
+
+
+def _differs(a: float, b: float) -> bool:
+    return abs(a / b - 1) > _RULES.unlike if b else True
+
+
+def _of_units(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
+    left = tracks.z[:, :2]
+    largest = float(np.abs(left).max())
+    if largest >= _RULES.normalised_max or camera.fu < _RULES.least_focal:
+        return None
+    return (
+        f"all left pixels are within {largest:.3g} of zero, so they are normalised coordinates or "
+        "shares of the image; multiply by the focal lengths and add the principal point (or multiply "
+        "by the image's size)"
+    )
+
+
+def _of_columns(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
+    """Of the rows with a right pixel: whether columns are in another order, or hold something
+    else.
+    """
+    z = tracks.z[tracks.has_right]
+    if camera.kind != "stereo" or len(z) < _RULES.fewest:
+        return None
+    for name, column in zip(_COLUMNS, z.T, strict=True):
+        if column.min() == column.max():
+            return (
+                f"{name} is {column[0]:g} in all {len(z)} rows with a right pixel; write what was "
+                "measured (of a rectified pair without own rows, vr = vl)"
+            )
+    if _is_pair(z):
+        return None
+    if fault := _of_right_columns(z):
+        return fault
+    for name, order in _ORDERS.items():
+        if _is_pair(z[:, order]):
+            return _other_order(name, z)
+    if _correlation(z[:, 1], z[:, 3]) < _RULES.unrelated:
+        apart = float(np.median(np.abs(z[:, 1] - z[:, 3])))
+        return (
+            f"the rows vl and vr of one id differ by {apart:.0f} px (median) and do not follow each "
+            "other: ur vr may be in another order than ids, or the columns are not ul vl ur vr"
+        )
+    return None
+
+
+def _of_right_columns(z: FloatArray) -> str | None:
+    """Whether ur is a disparity, or counts from the edge of an image of both cameras."""
+    disparities = z.copy()
+    disparities[:, 2] = z[:, 0] - z[:, 2]
+    is_apart = _correlation(z[:, 0], z[:, 2]) < _RULES.unrelated
+    if is_apart and float(np.mean(z[:, 2] > 0)) >= _RULES.most and _is_pair(disparities):
+        return (
+            "the third column does not follow ul, and is what ul - ur would be: a disparity; write "
+            "ur = ul - disparity"
+        )
+    if float(np.mean(z[:, 2] > z[:, 0].max())) >= _RULES.most:
+        return (
+            f"ur goes from {z[:, 2].min():.0f} to {z[:, 2].max():.0f}, right of all ul (up to "
+            f"{z[:, 0].max():.0f}): it counts from the left edge of an image of both cameras; "
+            "subtract the width of one"
+        )
+    return None
+
+
+def _other_order(name: str, z: FloatArray) -> str:
+    if name == _NEGATIVE:
+        share = float(np.mean(z[:, 0] < z[:, 2]))
+        return (
+            f"disparities ul - ur are negative in {100 * share:.0f} % of the rows: the right camera's "
+            "pixels come first, left and right cameras are exchanged, or u counts from the right "
+            "edge; write ul vl ur vr"
+        )
+    return f"the columns of z are in the order {name}, in which rows agree; write ul vl ur vr"
+
+
+def _is_pair(z: FloatArray) -> bool:
+    """Whether pixels (N, 4) are those of a rectified pair: rows agree, disparities are positive and
+    short beside the image, and pixels of left and right follow each other.
+    """
+    disparity = z[:, 0] - z[:, 2]
+    widest = np.ptp(z[:, 0])
+    rows = np.abs(z[:, 1] - z[:, 3]) <= _RULES.near_px
+    columns = (disparity > -_RULES.near_px) & (disparity < 0.5 * widest)
+    if min(float(rows.mean()), float(columns.mean())) < _RULES.most:
+        return False
+    return _correlation(z[:, 0], z[:, 2]) >= _RULES.unrelated
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    """Return the correlation of two series; 1 where one is constant."""
+    a = a - a.mean()
+    b = b - b.mean()
+    size = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / size if size else 1.0
+
+
+def _of_places(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
+    """Whether the left pixels lie in the image."""
+    left = tracks.z[:, :2]
+    if _outside(left, camera) <= _RULES.few:
+        return None
+    centre = np.array([camera.cu, camera.cv])
+    if (left < -_RULES.near_px).any() and _outside(left + centre, camera) <= _RULES.few:
+        return (
+            f"{100 * _outside(left, camera):.0f} % of the left pixels lie outside of the image, and "
+            "inside once the principal point is added, from which they count; add cu and cv to them"
+        )
+    low = left.min(axis=0)
+    high = left.max(axis=0)
+    size = "" if camera.width is None else f" of {camera.width} x {camera.height}"
+    return (
+        f"{100 * _outside(left, camera):.0f} % of the left pixels lie outside of the image{size} "
+        f"(u {low[0]:.0f} to {high[0]:.0f}, v {low[1]:.0f} to {high[1]:.0f}): they are those of images "
+        "of another size, or u and v are exchanged; intrinsics, image_size and pixels must be of one "
+        "image"
+    )
+
+
+def _outside(pixels: FloatArray, camera: StereoCamera) -> float:
+    """Return the share of pixels (N, 2) outside of the image."""
+    out = (pixels < -_RULES.near_px).any(axis=1)
+    if camera.width is not None and camera.height is not None:
+        size = np.array([camera.width, camera.height])
+        out |= (pixels > size + _RULES.near_px).any(axis=1)
+    return float(out.mean())
+
+
+def _of_ids(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
+    """Whether an id is one point: what one shows in two frames is nearer than what any two do."""
+    del camera
+    shares = []
+    seen = again = 0
+    ends = tracks.offsets.tolist()
+    for first, second, last in zip(ends, ends[1:], ends[2:], strict=False):
+        if min(second - first, last - second) < _RULES.fewest:
+            continue
+        before = slice(first, second)
+        after = slice(second, last)
+        common = _common(tracks.ids[before], tracks.ids[after])
+        seen += second - first
+        again += int(common[0].sum())
+        if common[0].sum() >= _RULES.fewest:
+            shares.append(_scatter(tracks.z[before, :2], tracks.z[after, :2], common))
+    if again < _RULES.again * seen:
+        return (
+            f"of {seen} features {again} have an id that the next frame has, too; give a point one id "
+            "in all frames that show it"
+        )
+    if not shares or np.median(shares) < _RULES.scatter:
+        return None
+    return (
+        "what an id shows moves from frame to frame as far as any other feature is, so ids are not "
+        "those of points (numbers of rows, or of matches between two frames); give a point one id in "
+        "all frames that show it"
+    )
+
+
+def _common(a: IntArray, b: IntArray) -> tuple[BoolArray, IntArray]:
+    """Return which entries of `a` (N,) are in `b`, and where in `b` each of those is."""
+    order = np.argsort(b)
+    place = np.minimum(np.searchsorted(b[order], a), len(b) - 1)
+    found = b[order][place] == a
+    return found, order[place[found]]
+
+
+def _scatter(before: FloatArray, after: FloatArray, common: tuple[BoolArray, IntArray]) -> float:
+    """Return how far pixels of the same ids spread about their median motion, over how far those of
+    other ids do.
+    """
+    held, place = common
+    from_px = before[held]
+    to_px = after[place]
+    others = np.roll(to_px, len(to_px) // 2, axis=0)
+    return _spread(to_px - from_px) / max(_spread(others - from_px), 1e-9)
+
+
+def _spread(motions: FloatArray) -> float:
+    from_median = motions - np.median(motions, axis=0)
+    return float(np.median(np.hypot(from_median[:, 0], from_median[:, 1])))
