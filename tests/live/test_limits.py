@@ -281,6 +281,7 @@ def _is_lost(source: Any, within_s: float) -> bool:
 def _oak() -> OakSource:
     source = OakSource.__new__(OakSource)
     source._name = "oak"
+    source._dai = MagicMock()
     source._imu = None
     source._images = [SimpleNamespace(tryGetAll=list)] * 2
     return source

@@ -409,15 +409,15 @@ def test_rows_of_a_rolling_shutter_show_their_own_time(plain: Simulation) -> Non
     rolled = _recording(plain, replace(CLEAN, readout_ms=readout_ms))
     still = _recording(plain, CLEAN)
     height = plain.rig.cam0.height
-    frame = 12
+    frame = 30
     time_ns = int(plain.taken_ns[frame])
     image = rolled.images(frame)[0].astype(float)
     at_once = still.images(frame)[0].astype(float)
     for row in (6, height // 2, height - 7):
         late = (row - 0.5 * (height - 1)) / height * readout_ms
         then = still._sharp(0, time_ns + round(1e6 * late))[row]
-        off = float(np.median(np.abs(image[row] - then)))
-        off_at_once = float(np.median(np.abs(image[row] - at_once[row])))
-        assert off < 2.0
+        off = float(np.abs(image[row] - then).mean())
+        off_at_once = float(np.abs(image[row] - at_once[row]).mean())
+        assert off < 4.0
         if abs(late) > 20:
-            assert off_at_once > 2 * off
+            assert off_at_once > 4 * off
