@@ -64,10 +64,6 @@ class _ViewRules(NamedTuple):
     # live for a few frames only in rain
     unseen_frames: int = 3
     min_seen: int = 4
-    # of that frame's points, to follow the motion where others of it do not: healthy variants of three
-    # recordings have 0.55 and more; where another scene comes into view, a few at the horizon, which
-    # follow any translation, 0.25 and less
-    follow_share: float = 0.25
     min_flow_px: float = 1.0  # of a motion that can be told from none
     extrapolated_frames: int = 10  # for which a motion goes on as it was, at most
     kept_share: float = 0.25  # of the points, that must still be in view by it to be missed
@@ -193,20 +189,10 @@ class SceneMotion:
         return SceneChoice(chosen.motion, chosen.object_share, hidden, slow)
 
     def _goes_on(self, index: int, points: MovedPoints, motion: Consensus) -> bool:
-        """Whether points of the last frame of the scene follow a motion: most of those that are
-        still followed, or many of all.
-
-        Those that the motion of another scene has left are those that follow it.
-        """
-        scene = self._scene
-        old = points.age >= (1 if scene is None else index - scene.index)
-        again = int((motion.inliers & old).sum())
-        if again < _VIEW.min_seen:
-            return False
-        if self._unseen == 0 and again > 0.5 * old.sum():
-            return True
-        usual = 0 if scene is None else int(scene.motion.inliers.sum())
-        return again >= _VIEW.follow_share * usual
+        """Whether points of the last frame of the scene follow a motion."""
+        frames = 1 if self._scene is None else index - self._scene.index
+        again = motion.inliers & (points.age >= frames)
+        return int(again.sum()) >= _VIEW.min_seen
 
     def _see_scene(
         self,
