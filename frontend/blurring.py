@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from vio.frontend.align import Pixels
 from vio.frontend.patches import Patches
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
@@ -14,8 +14,6 @@ from vio.records import IntArray
 _STEP_PX2: Tolerance[float] = 0.5  # of a diffusion, which takes a pixel of the margin
 MARGIN_PX = 6  # of a patch, beyond what is returned of it
 MAX_SPREAD_PX2 = MARGIN_PX * _STEP_PX2  # trace of a covariance: a path of 6 px
-
-Row = npt.NDArray[np.float32]  # (N,) pixels
 
 
 def spread_out(sharp: Patches, spread: FloatArray, slots: IntArray) -> Patches:
@@ -43,7 +41,7 @@ def _spread_out(sharp: Patches, spread: FloatArray, slots: IntArray, out: Patche
     whole = sharp.shape[1]
     pixels = whole * whole
     side = out.shape[1]
-    rooms = np.empty((2, pixels), np.float32)
+    buffers = np.empty((2, pixels), np.float32)
     for n, slot in enumerate(slots):
         trace = spread[slot, 0] + spread[slot, 1]
         steps = int(np.ceil(trace / _STEP_PX2 - 1e-9))
@@ -53,7 +51,7 @@ def _spread_out(sharp: Patches, spread: FloatArray, slots: IntArray, out: Patche
         uv = np.float32(0.5 * share * spread[slot, 2])
         patch = sharp[slot].reshape(pixels)
         for step in range(MARGIN_PX - steps + 1, MARGIN_PX + 1):
-            after = rooms[step % 2]
+            after = buffers[step % 2]
             first = step * (whole + 1)
             _diffuse(patch, first, pixels - 2 * first, whole, uu, vv, uv, after)
             patch = after
@@ -65,14 +63,14 @@ def _spread_out(sharp: Patches, spread: FloatArray, slots: IntArray, out: Patche
 
 @compiled
 def _diffuse(
-    before: Row,
+    before: Pixels,
     first: int,
     count: int,
     whole: int,
     uu: np.float32,
     vv: np.float32,
     uv: np.float32,
-    after: Row,
+    after: Pixels,
 ) -> None:
     """Write a step for `count` pixels from `first` on, row by row of `whole` pixels.
 

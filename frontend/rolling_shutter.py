@@ -20,7 +20,7 @@ from vio.errors import ConfigError
 from vio.geometry.lie import FloatArray, circledot, se3_exp
 from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
 from vio.numerics.kinds import Tolerance
-from vio.records import NS_PER_S, BoolArray, IntArray, Observations, shared_rows
+from vio.records import NS_PER_S, IntArray, Observations, shared_rows
 
 
 class _ShutterRules(NamedTuple):
@@ -63,12 +63,10 @@ class _RowTimes:
         self._readout_s = camera.readout_s
         self._rows: tuple[IntArray | None, ...] = (None, None)
         heights = (camera.height, camera.height)
-        if rectifier is not None and len(rectifier.cameras) == 1:
-            self._rows = (rectifier.rows(0), rectifier.rows(0))
-            heights = (rectifier.cameras[0].height,) * 2
-        elif rectifier is not None:
-            self._rows = (rectifier.rows(0), rectifier.rows(1))
-            heights = (rectifier.rig.cam0.height, rectifier.rig.cam1.height)
+        if rectifier is not None:
+            last = len(rectifier.cameras) - 1  # virtual right pixels are of the only camera
+            self._rows = (rectifier.rows(0), rectifier.rows(last))
+            heights = (rectifier.cameras[0].height, rectifier.cameras[last].height)
         if None in heights:
             raise ConfigError(
                 "a rolling shutter needs the height of the images, which the recording does not "
@@ -103,7 +101,6 @@ class RollingShutter:
             ConfigError: the height of the images is not known.
         """
         self._camera = camera
-        self._readout_s = abs(camera.readout_s)
         self._times = _RowTimes(camera, rectifier)
         self._last: _Seen | None = None
         self._velocity: _Velocity | None = None
@@ -127,7 +124,11 @@ class RollingShutter:
             elapsed_s = (seen.time_ns - last.features.time_ns) / NS_PER_S
             between_s = elapsed_s + late_s[rows, 0] - last.late_s[others, 0]
             between_s = np.maximum(between_s, _RULES.least_elapsed * elapsed_s)
-            self._learn(p, has_depth, rows, last.features, others, between_s)
+            use = has_depth[rows] & last.features.has_right[others] & ~last.features.stale[others]
+            if int(use.sum()) >= _RULES.min_features:
+                middle_ns = (last.features.time_ns + seen.time_ns) // 2
+                z_before = last.features.z[others[use], :3]
+                self._learn(p[rows[use]], z_before, between_s[use], middle_ns)
             flow = (seen.z[rows] - last.features.z[others]) / between_s[:, None]
             both = seen.has_right[rows] & last.features.has_right[others]
             flow[~both, 2:] = 0.0
@@ -143,36 +144,20 @@ class RollingShutter:
                 shift = (project(self._camera, there) - before)[:, columns]
                 z[has_depth, columns] = seen.z[has_depth, columns] + shift
             moved |= has_depth
-        moved |= np.abs(late_s[:, 0]) <= 0.5 * _RULES.middle_share * self._readout_s
+        middle_s = 0.5 * _RULES.middle_share * abs(self._camera.readout_s)
+        moved |= np.abs(late_s[:, 0]) <= middle_s
         return replace(seen, z=z).take(moved)
 
-    def _learn(
-        self,
-        p: FloatArray,
-        has_depth: BoolArray,
-        rows: IntArray,
-        last: Observations,
-        others: IntArray,
-        between_s: FloatArray,
-    ) -> None:
-        """Fit the velocity since the last frame to the rows (K,) that it shares with rows `others`
-        of the last one.
+    def _learn(self, p: FloatArray, z: FloatArray, between_s: FloatArray, middle_ns: int) -> None:
+        """Fit the velocity to points and their pixels before, see `_fitted`, of an interval with
+        its middle.
         """
-        use = has_depth[rows] & last.has_right[others] & ~last.stale[others]
-        if int(use.sum()) < _RULES.min_features or self._last is None:
-            return
-        elapsed_ns = self._last.features.time_ns - last.time_ns
         before = self._velocity
-        twist = _fitted(
-            self._camera,
-            p[rows[use]],
-            last.z[others[use], :3],
-            between_s[use],
-            np.zeros(6) if before is None else before.twist,
-        )
+        start = np.zeros(6) if before is None else before.twist
+        twist = _fitted(self._camera, p, z, between_s, start)
         if twist is not None:
             self._before = before
-            self._velocity = _Velocity(twist, last.time_ns + elapsed_ns // 2)
+            self._velocity = _Velocity(twist, middle_ns)
 
     def _velocity_at(self, time_ns: int) -> FloatArray | None:
         """The twist (6,) per second at a time, as far as the last velocities go on; None: they
@@ -210,8 +195,8 @@ def _fitted(
     """
     for _ in range(_RULES.steps):
         there = _moved(p, -between_s[:, None] * twist)
-        if not (there[:, 2] > _MIN_DEPTH_M).all():
-            ahead = there[:, 2] > _MIN_DEPTH_M
+        ahead = there[:, 2] > _MIN_DEPTH_M
+        if not ahead.all():
             if ahead.sum() < _RULES.min_features:
                 return None
             p, z, between_s, there = p[ahead], z[ahead], between_s[ahead], there[ahead]

@@ -119,8 +119,8 @@ class Rectifier:
         return np.where(inside, depth_m[row, column], 0.0)
 
     def rows(self, camera: int) -> IntArray | None:
-        """Rows (H, W) of a camera's raw image, to a pixel, that the pixels of its rectified one come
-        from; camera 0 is the left one. None: nothing is rectified.
+        """Rows (H, W) of a camera's raw image, to a pixel, that the pixels of its rectified one
+        come from; camera 0 is the left one. None: nothing is rectified.
         """
         if self.maps is None:
             return None
@@ -249,8 +249,8 @@ class Rig:
             )
         if not abs(self.readout_s) <= _MAX_READOUT_S:
             raise CalibrationError(
-                f"the readout time of the shutter is {self.readout_s:g} s; give seconds from the first "
-                "row to the last, such as 0.02"
+                f"the readout time of the shutter is {self.readout_s:g} s; give seconds from the "
+                "first row to the last, such as 0.02"
             )
 
     @classmethod

@@ -17,7 +17,7 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import DOUBT, BoolArray, FeatureTracks, IntArray
+from vio.records import DOUBT, FeatureTracks, shared_rows
 
 
 class _Rules(NamedTuple):
@@ -276,11 +276,13 @@ def _of_ids(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
             continue
         before = slice(first, second)
         after = slice(second, last)
-        common = _common(tracks.ids[before], tracks.ids[after])
+        rows, others = shared_rows(tracks.ids[before], tracks.ids[after])
         seen += second - first
-        again += int(common[0].sum())
-        if common[0].sum() >= _RULES.fewest:
-            shares.append(_scatter(tracks.z[before, :2], tracks.z[after, :2], common))
+        again += len(rows)
+        if len(rows) >= _RULES.fewest:
+            in_order = rows.argsort()  # of the rows, so that those half of them apart are apart
+            from_px = tracks.z[before, :2][rows[in_order]]
+            shares.append(_scatter(from_px, tracks.z[after, :2][others[in_order]]))
     if again < _RULES.again * seen:
         return (
             f"of {seen} features {again} have an id that the next frame has, too; give a point one id "
@@ -295,21 +297,10 @@ def _of_ids(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
     )
 
 
-def _common(a: IntArray, b: IntArray) -> tuple[BoolArray, IntArray]:
-    """Return which entries of `a` (N,) are in `b`, and where in `b` each of those is."""
-    order = np.argsort(b)
-    place = np.minimum(np.searchsorted(b[order], a), len(b) - 1)
-    found = b[order][place] == a
-    return found, order[place[found]]
-
-
-def _scatter(before: FloatArray, after: FloatArray, common: tuple[BoolArray, IntArray]) -> float:
-    """Return how far pixels of the same ids spread about their median motion, over how far those of
-    other ids do.
+def _scatter(from_px: FloatArray, to_px: FloatArray) -> float:
+    """Return how far pixels (N, 2) of the same ids spread about their median motion, over how far
+    those of other ids do.
     """
-    held, place = common
-    from_px = before[held]
-    to_px = after[place]
     others = np.roll(to_px, len(to_px) // 2, axis=0)
     return _spread(to_px - from_px) / max(_spread(others - from_px), 1e-9)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -208,12 +209,24 @@ def along_flow(image: Radiance, flow: FloatArray) -> Radiance:
     """Return the image (H, W) that shows at each pixel what another one has a flow (H, W, 2) from
     there, pixels.
     """
-    height, width = image.shape
-    u, v = np.meshgrid(np.arange(width), np.arange(height))
-    at = (flow + np.stack([u, v], axis=-1)).astype(np.float32)
+    at = (flow + _pixels(image.shape)).astype(np.float32)
+    return _looked_up(image, at, cv2.INTER_CUBIC)
+
+
+def _pixels(shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+    """Pixels (H, W, 2) of an image."""
+    height, width = shape
+    u = np.arange(width, dtype=np.float32)
+    v = np.arange(height, dtype=np.float32)
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def _looked_up(image: Radiance, at: npt.NDArray[Any], interpolation: int) -> Radiance:
+    """An image (H, W) at pixels (H, W, 2), its border repeated."""
     # One map of both coordinates, which OpenCV's stubs do not know.
-    moved = cv2.remap(image, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-    return np.asarray(moved, dtype=np.float32)
+    return cv2.remap(  # type: ignore[call-overload]
+        image, at, None, interpolation, borderMode=cv2.BORDER_REPLICATE
+    )
 
 
 def blur_along_flow(
@@ -230,18 +243,12 @@ def blur_along_flow(
         flow_after: (H, W, 2) pixels from here to where the point is when it closes.
         taps: number of samples along the path.
     """
-    height, width = sharp.shape
-    here = np.stack(
-        np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)),
-        axis=-1,
-    )
+    here = _pixels(sharp.shape)
     before, after = (np.asarray(flow, dtype=np.float32) for flow in (flow_before, flow_after))
     total = np.zeros_like(sharp)
     for position in (np.arange(taps) + 0.5) / taps * 2 - 1:
         # The pixel's content at another time is found upstream along the flow.
         at = cv2.scaleAdd(after if position > 0 else before, -abs(float(position)), here)
-        # One map of both coordinates, which OpenCV's stubs do not know.
-        moved = cv2.remap(sharp, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-        cv2.accumulate(moved, total)
+        cv2.accumulate(_looked_up(sharp, at, cv2.INTER_LINEAR), total)
     total *= np.float32(1 / taps)
     return total
