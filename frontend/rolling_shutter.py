@@ -17,10 +17,11 @@ import numpy as np
 from vio.cameras.rig import Rectifier
 from vio.dataclass import dataclass
 from vio.errors import ConfigError
-from vio.geometry.lie import FloatArray, circledot, se3_exp
+from vio.findings import Finding
+from vio.frontend.readout_time import MIN_DEPTH_M, ReadoutTime, RowShares, moved_by
+from vio.geometry.lie import FloatArray, circledot
 from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
-from vio.numerics.kinds import Tolerance
-from vio.records import NS_PER_S, IntArray, Observations, shared_rows
+from vio.records import NS_PER_S, Observations, shared_rows
 
 
 class _ShutterRules(NamedTuple):
@@ -37,7 +38,6 @@ class _ShutterRules(NamedTuple):
 
 
 _RULES = _ShutterRules()
-_MIN_DEPTH_M: Tolerance[float] = 0.05  # of points moved by a velocity that is not fitted yet
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,65 +56,51 @@ class _Velocity:
     middle_ns: int  # of the interval
 
 
-class _RowTimes:
-    """When pixels were exposed, after the middle row of the raw image of their camera."""
-
-    def __init__(self, camera: StereoCamera, rectifier: Rectifier | None) -> None:
-        self._readout_s = camera.readout_s
-        self._rows: tuple[IntArray | None, ...] = (None, None)
-        heights = (camera.height, camera.height)
-        if rectifier is not None:
-            last = len(rectifier.cameras) - 1  # virtual right pixels are of the only camera
-            self._rows = (rectifier.rows(0), rectifier.rows(last))
-            heights = (rectifier.cameras[0].height, rectifier.cameras[last].height)
-        if None in heights:
-            raise ConfigError(
-                "a rolling shutter needs the height of the images, which the recording does not "
-                "state; leave frontend.readout_ms out"
-            )
-        self._heights = tuple(int(height or 0) for height in heights)
-
-    def of(self, z: FloatArray) -> FloatArray:
-        """Times (N, 2) of the left and the right pixels (N, 4), s; arbitrary where a pixel is."""
-        late = np.empty((len(z), 2))
-        for camera, (raw, height) in enumerate(zip(self._rows, self._heights, strict=True)):
-            rows = z[:, 2 * camera + 1]
-            if raw is not None:
-                pixels = np.nan_to_num(z[:, 2 * camera : 2 * camera + 2])
-                u, v = np.rint(pixels).astype(np.int64).T
-                rows = raw[np.clip(v, 0, len(raw) - 1), np.clip(u, 0, raw.shape[1] - 1)]
-            late[:, camera] = (rows - 0.5 * (height - 1)) * (self._readout_s / height)
-        return late
-
-
 class RollingShutter:
     """Moves the features of each frame to the time of its middle row."""
 
     def __init__(self, camera: StereoCamera, rectifier: Rectifier | None = None) -> None:
-        """Prepare for the images of a camera with a `readout_s`.
+        """Prepare for the images of a camera; without a `readout_s`, that is looked for.
 
         Args:
             camera: rectified.
             rectifier: of its raw images, whose rows count; None: they are rectified.
 
         Raises:
-            ConfigError: the height of the images is not known.
+            ConfigError: `readout_s` is stated, and the height of the images is not known.
         """
         self._camera = camera
-        self._times = _RowTimes(camera, rectifier)
+        self._readout_s = camera.readout_s
+        self._shares = RowShares(camera, rectifier)
+        self._search = None if camera.readout_s else ReadoutTime(camera, self._shares)
+        if camera.readout_s and not self._shares.known:
+            raise ConfigError(
+                "a rolling shutter needs the height of the images, which the recording does not "
+                "state; leave frontend.readout_ms out"
+            )
         self._last: _Seen | None = None
         self._velocity: _Velocity | None = None
         self._before: _Velocity | None = None
 
+    def take_findings(self) -> tuple[Finding, ...]:
+        """Return the findings since the last call."""
+        return () if self._search is None else self._search.take_findings()
+
     def corrected(self, seen: Observations) -> Observations:
-        """Return a frame's features at the time of its middle row.
+        """Return a frame's features at the time of its middle row; as they are, while no readout
+        time is known.
 
         Features without depth are moved by how far their pixels have moved since the last frame.
         What cannot be moved, as there is no velocity yet, is left out, but for the middle rows.
         """
+        if self._search is not None and not self._readout_s:
+            self._search.frame(seen)
+            if not self._search.is_rolling:
+                return seen
+            self._readout_s = self._search.readout_s
         p, has_depth = triangulate(self._camera, seen.z, min_disparity_px=DEPTH_DISPARITY_PX)
         has_depth &= seen.has_right & ~seen.stale
-        late_s = self._times.of(seen.z)
+        late_s = self._readout_s * self._shares.of(seen.z)
         last = self._last
         self._last = _Seen(seen, late_s)
         moved = np.zeros(len(seen), dtype=np.bool_)
@@ -140,11 +126,11 @@ class RollingShutter:
             before = project(self._camera, here)
             for camera in (0, 1):
                 columns = slice(2 * camera, 2 * camera + 2)
-                there = _moved(here, -late_s[has_depth, camera, None] * velocity)
+                there = moved_by(here, -late_s[has_depth, camera, None] * velocity)
                 shift = (project(self._camera, there) - before)[:, columns]
                 z[has_depth, columns] = seen.z[has_depth, columns] + shift
             moved |= has_depth
-        middle_s = 0.5 * _RULES.middle_share * abs(self._camera.readout_s)
+        middle_s = 0.5 * _RULES.middle_share * abs(self._readout_s)
         moved |= np.abs(late_s[:, 0]) <= middle_s
         return replace(seen, z=z).take(moved)
 
@@ -173,13 +159,6 @@ class RollingShutter:
         return now.twist + min(share, 1.0) * (now.twist - before.twist)
 
 
-def _moved(p: FloatArray, twists: FloatArray) -> FloatArray:
-    """Points (N, 3) after their own twists (N, 6)."""
-    T = se3_exp(twists).reshape(-1, 4, 4)
-    out: FloatArray = (T[:, :3, :3] @ p[:, :, None])[:, :, 0] + T[:, :3, 3]
-    return out
-
-
 def _fitted(
     camera: StereoCamera, p: FloatArray, z: FloatArray, between_s: FloatArray, twist: FloatArray
 ) -> FloatArray | None:
@@ -194,8 +173,8 @@ def _fitted(
         twist: to begin with.
     """
     for _ in range(_RULES.steps):
-        there = _moved(p, -between_s[:, None] * twist)
-        ahead = there[:, 2] > _MIN_DEPTH_M
+        there = moved_by(p, -between_s[:, None] * twist)
+        ahead = there[:, 2] > MIN_DEPTH_M
         if not ahead.all():
             if ahead.sum() < _RULES.min_features:
                 return None

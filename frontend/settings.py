@@ -128,7 +128,8 @@ class FrontendSettings(Section):
     readout_ms: float | None = setting(
         None,
         "rolling shutter: time from the exposure of the first row to that of the last, negative if "
-        "the last row is first; null: the calibration's (Kalibr's line_delay)",
+        "the last row is first; null: the calibration's (Kalibr's line_delay), or what the run finds; "
+        "0: none",
         unit="ms",
         at_least=-100,
         at_most=100,

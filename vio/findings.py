@@ -105,6 +105,16 @@ CODES: dict[str, Code] = {
         "dots of a projector are taken out of the images",
         "switch the projector off",
     ),
+    "rolling-shutter": Code(
+        "unusable",
+        "rows are exposed one after the other; from then on features are moved to one time",
+        "set frontend.readout_ms",
+    ),
+    "shutter-put-right": Code(
+        "nominal",
+        "rows are exposed one after the other, and the run began again with that put right",
+        "set frontend.readout_ms",
+    ),
     "images-exchanged": Code(
         "degraded",
         "left and right images are exchanged for a while; they are put back, or left out",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -11,16 +12,19 @@ import pytest
 import vio
 from vio.cameras.rig import rectifier_of
 from vio.errors import ConfigError
+from vio.findings import Finding
+from vio.frontend.readout_time import RowShares
 from vio.frontend.rolling_shutter import RollingShutter
 from vio.geometry.distortion import project_point
 from vio.geometry.lie import FloatArray, se3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project
-from vio.records import Image, Observations, observations
+from vio.records import Image, Observations, StereoFrame, observations
+from vio.runs.pipeline import RunResult
 from vio.sim.effects import CLEAN
 from vio.sim.motion import hand_held
 from vio.sim.rigs import euroc_like_rig, euroc_rectified_rig
 from vio.sim.scenarios import scaled
-from vio.sim.sequence import SimulatedRecording, simulate
+from vio.sim.sequence import SimulatedRecording, Simulation, simulate
 from vio.sim.world import room
 
 _STEP_S = 0.05
@@ -167,7 +171,7 @@ def test_rows_of_the_raw_image_count() -> None:
     u = np.array([camera.width // 2, 20])
     v = np.array([30, camera.height - 30])
     pixels = np.stack([u, v, u, v], axis=1).astype(float)
-    late_s = RollingShutter(camera, rectifier)._times.of(pixels)
+    late_s = _READOUT_S * RowShares(camera, rectifier).of(pixels)
     for number, lens in enumerate(rectifier.cameras):
         T = rectifier.rig.T_imu_cam0 if number == 0 else rectifier.rig.T_imu_cam1
         R_rect_cam = rectifier.T_rect0_imu[:3, :3] @ T[:3, :3]
@@ -190,19 +194,56 @@ class _Kept(SimulatedRecording):
         return super().images(index)
 
 
-def test_a_run_with_the_readout_time_is_like_one_of_a_global_shutter() -> None:
+@pytest.fixture(scope="module")
+def plan() -> Simulation:
     rig = scaled(euroc_rectified_rig(), 320)
-    motion = hand_held(duration_s=2.5)
+    motion = hand_held(duration_s=3.5)
     rolling = replace(CLEAN, readout_ms=20.0)
-    plan = simulate(room(1, texel_m=0.01), rig, motion, rate_hz=20.0, effects=rolling)
-    rolled = _Kept(plan)
-    at_once = _Kept(replace(plan, effects=CLEAN))
-    errors = []
-    for dataset, readout_ms in ((at_once, "null"), (rolled, "null"), (rolled, "20")):
-        config = vio.load_config(overrides=["motion=none", f"frontend.readout_ms={readout_ms}"])
-        result = vio.run(dataset, config)
-        score = vio.evaluate(result.trajectory, dataset.reference, T_cam0_imu=result.T_cam0_body)
-        errors.append(score.ate_m.rmse)
-    exposed_at_once, as_rolled, corrected = errors
-    assert as_rolled > 8 * exposed_at_once
-    assert corrected < as_rolled / 3
+    return simulate(room(1, texel_m=0.01), rig, motion, rate_hz=20.0, effects=rolling)
+
+
+@pytest.fixture(scope="module")
+def rolled(plan: Simulation) -> _Kept:
+    return _Kept(plan)
+
+
+def _run(dataset: _Kept, readout_ms: str) -> tuple[RunResult, float]:
+    config = vio.load_config(overrides=["motion=none", f"frontend.readout_ms={readout_ms}"])
+    result = vio.run(dataset, config)
+    score = vio.evaluate(result.trajectory, dataset.reference, T_cam0_imu=result.T_cam0_body)
+    return result, score.ate_m.rmse
+
+
+def _shutters(findings: Iterable[Finding]) -> list[str]:
+    return [f.code for f in findings if "shutter" in f.code]
+
+
+def test_a_run_finds_the_readout_time_and_is_like_one_of_a_global_shutter(
+    plan: Simulation, rolled: _Kept
+) -> None:
+    at_once, exposed_at_once = _run(_Kept(replace(plan, effects=CLEAN)), "null")
+    as_rolled, uncorrected = _run(rolled, "0")  # states a global shutter
+    stated, corrected = _run(rolled, "20")
+    found, by_itself = _run(rolled, "null")
+    assert uncorrected > 8 * exposed_at_once
+    assert corrected < uncorrected / 3
+    assert by_itself < uncorrected / 3
+    assert not _shutters((*at_once.findings, *as_rolled.findings, *stated.findings))
+    assert _shutters(found.findings) == ["shutter-put-right"]
+    assert found.repair.readout_s == pytest.approx(0.02, rel=0.1)
+    assert {e.integrity for e in found.estimates} == {"nominal"}
+    calibrated = found.calibrated_rig()
+    assert calibrated is not None
+    assert calibrated.rig.readout_s == found.repair.readout_s
+
+
+def test_live_use_goes_on_with_features_of_one_time(rolled: _Kept) -> None:
+    odometry = vio.Odometry(rolled.recording.camera)
+    for event in rolled.events():
+        if isinstance(event, StereoFrame):
+            assert event.left is not None
+            assert event.right is not None
+            odometry.add_stereo(event.time_ns, event.left, event.right)
+    (finding,) = [f for f in odometry.findings if "shutter" in f.code]
+    assert (finding.code, finding.effect, finding.since) == ("rolling-shutter", "unusable", 0)
+    assert finding.figures["readout_ms"] == pytest.approx(20.0, rel=0.1)

@@ -37,17 +37,17 @@ LIMITS = {
     "CHANGELOG.md": 1400,
     "docs/architecture.md": 1230,
     "docs/bench.md": 1300,
-    "docs/cameras.md": 930,
+    "docs/cameras.md": 960,
     "docs/commands.md": 860,
     "docs/conventions.md": 910,
     "docs/fault_draws.md": 1100,
     "docs/faults.md": 1300,
-    "docs/findings.md": 1100,
+    "docs/findings.md": 1150,
     "docs/frontend.md": 1170,
     "docs/inertial.md": 1290,
     "docs/live.md": 1320,
     "docs/maps.md": 1340,
-    "docs/math.md": 6330,
+    "docs/math.md": 6400,
     "docs/neighbours.md": 1350,
     "docs/notes/consistency.md": 880,
     "docs/recordings.md": 1750,
@@ -56,7 +56,7 @@ LIMITS = {
     "docs/simulation.md": 1040,
     "docs/tutorials/target.md": 1390,
 }
-ALL_PAGES = 45_000
+ALL_PAGES = 45_500
 
 # Each with what to write in its place.
 BANNED = {

@@ -38,7 +38,7 @@ _BITS = 5  # of the parts of a pixel, 32, in which OpenCV's remap counts
 # two exposures.
 _DISPARITY_SIGMAS = 2**0.5
 _PIXEL_SIGMA_PX = 0.2  # of a tracked feature; what the filter learns on real images is 0.1 to 0.3
-_MAX_READOUT_S = 0.1  # of a rolling shutter: an image at 10 Hz
+MAX_READOUT_S = 0.1  # of a rolling shutter: an image at 10 Hz
 # maps for cv2.remap: u and v, or those of `fixed_point`
 LookUp: TypeAlias = tuple[npt.NDArray[Any], npt.NDArray[Any]]
 
@@ -247,7 +247,7 @@ class Rig:
             raise CalibrationError(
                 f"the time offset of camera and IMU is {self.time_offset_s}; give finite seconds"
             )
-        if not abs(self.readout_s) <= _MAX_READOUT_S:
+        if not abs(self.readout_s) <= MAX_READOUT_S:
             raise CalibrationError(
                 f"the readout time of the shutter is {self.readout_s:g} s; give seconds from the "
                 "first row to the last, such as 0.02"

@@ -1,6 +1,6 @@
-"""A recording whose images are wrong in the same way from its start, and put right when it is read:
-right ones belong to the left images of other frames, or are those of a turned camera; all show the
-dots of a projector.
+"""A recording whose images are wrong in the same way from its start, and put right when it is read
+or used: right ones belong to the left images of other frames, or are those of a turned camera; all
+show the dots of a projector, or were exposed row after row.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ class Repair:
     # (3,) rad, by which their camera shows points p of its rectified frame as `exp(turn) p`
     turn: tuple[float, ...] | None = None
     dots: bool = False  # projected dots are taken out of all images
+    readout_s: float = 0.0  # of a rolling shutter, as `StereoCamera` has it
 
     def __bool__(self) -> bool:
-        return self.delay != 0 or self.turn is not None or self.dots
+        return self != AS_READ
 
     def adding(self, finding: Finding) -> Repair:
         """Return the repair of what a run found beside this one; itself where that is nothing new.
@@ -38,6 +39,8 @@ class Repair:
         figures = finding.figures
         if finding.code == "projected-dots" and finding.since == 0:
             return replace(self, dots=True)
+        if finding.code == "rolling-shutter" and not self.readout_s:
+            return replace(self, readout_s=1e-3 * figures["readout_ms"])
         if finding.code == "pairs-shifted" and self.delay == 0:
             return replace(self, delay=round(figures["delay_frames"]))
         if finding.code == "right-camera-turned" and self.turn is None and finding.since == 0:
@@ -51,7 +54,12 @@ class Repair:
         turn = None if self.turn is None else list(self.turn)
         if not self:
             return None
-        return {"late_frames": self.delay, "turned_rad": turn, "dots_taken_out": self.dots}
+        return {
+            "late_frames": self.delay,
+            "turned_rad": turn,
+            "dots_taken_out": self.dots,
+            "readout_s": self.readout_s,
+        }
 
     @classmethod
     def of_json(cls, stated: Mapping[str, Any] | None) -> Repair:
@@ -63,6 +71,7 @@ class Repair:
             stated.get("late_frames", 0),
             None if turn is None else tuple(turn),
             stated.get("dots_taken_out", False),
+            stated.get("readout_s", 0.0),
         )
 
     def lines(self) -> tuple[tuple[str, str], ...]:
@@ -88,6 +97,14 @@ class Repair:
                 "the run began again without the dots; switch the projector off"
             )
             out.append(("projected-dots", line))
+        if self.readout_s:
+            ms = 1e3 * self.readout_s
+            line = (
+                f"the shutter rolls: rows are exposed one after the other within {abs(ms):.1f} ms, by "
+                "how features move where the velocity changes; the run began again with features "
+                f"moved to the time of the middle row; set frontend.readout_ms to {ms:.1f}"
+            )
+            out.append(("shutter-put-right", line))
         return tuple(out)
 
 

@@ -71,6 +71,7 @@ class Source:
     # the recording, or the features used in place of its images; None: live
     features: Dataset | None = None
     right_delay: int = 0  # frames by which right images and pixels are known to be late
+    readout_s: float = 0.0  # of a rolling shutter that was found; 0: the camera's own
     # of a live rig's raw images; None: a recording, which has its own, or rectified images
     rectifier: Rectifier | None = None
 
@@ -240,11 +241,15 @@ def _frontend(source: Source, config: Config, parts: Parts, seen: StereoCamera) 
 
 
 def _shutter(camera: StereoCamera, config: Config, source: Source) -> RollingShutter | None:
-    """Return what moves the pixels of a rolling shutter; None: all rows are exposed at once."""
+    """Return what moves the pixels of a rolling shutter, or finds that there is one; None: the
+    settings state that all rows are exposed at once.
+    """
     if config.frontend.readout_ms is not None:
         camera = replace(camera, readout_s=1e-3 * config.frontend.readout_ms)
-    if not camera.readout_s:
-        return None
+        if not camera.readout_s:
+            return None
+    elif source.readout_s:
+        camera = replace(camera, readout_s=source.readout_s)
     rectifier = source.rectifier
     if isinstance(source.features, RectifyingDataset):
         rectifier = source.features.rectifier

@@ -170,7 +170,11 @@ class FramePipeline:
         output = self.frontend.process(checked, prior)
         if self._shutter is None:
             return output
-        return replace(output, observations=self._shutter.corrected(output.observations))
+        seen = self._shutter.corrected(output.observations)
+        found = self._shutter.take_findings()
+        if seen is output.observations and not found:
+            return output
+        return replace(output, observations=seen, findings=(*output.findings, *found))
 
     def usable(self, sample: MotionSample) -> MotionSample | None:
         """Return a sample as the back end takes it.

@@ -96,11 +96,11 @@ class RunMonitor:
         self._scale_lines: list[Finding] = []  # not reported yet
         self.imu_verdict = ImuVerdict()  # by the findings so far
         self.findings: list[Finding] = []
-        # whether the run begins again once more of its right images can be put right
+        # whether the run begins again once more of its images can be put right
         self.ends_at_repair = False
         # whether the run still can estimate its frames again with what is left of the IMU
         self.can_begin_again = False
-        self.repair = AS_READ  # of the recording's right images, by what was found so far
+        self.repair = AS_READ  # of the recording's images, by what was found so far
         self._integrity = IntegrityMonitor()
 
     def samples(self, samples: Iterable[MotionSample]) -> None:

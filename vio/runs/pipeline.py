@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -60,6 +61,8 @@ if TYPE_CHECKING:
 
 __all__ = ["STAGES", "FrameLog", "RunControl", "RunResult", "Viewers", "run"]
 
+log = logging.getLogger(__name__)
+
 _MAX_NAMED = 5  # frames that could not be read
 # frames that the front end refused, and more of them than not, before a run gives up
 _MIN_REFUSED = 10
@@ -84,7 +87,7 @@ class RunResult:
     wall_s: float
     stopped: str | None = None  # why the run ended before the recording; None: it did not
     rig: Rig | None = None  # the calibration as given; None: features without an image size
-    repair: Repair = AS_READ  # what the run put right of the recording's right images
+    repair: Repair = AS_READ  # what the run put right of the recording's images
     mapped: MappedRun | None = None  # where a map was built or used
     # standard deviation that motion sensor and field of disparities add to what the settings state
     # of the scale, over it
@@ -103,11 +106,14 @@ class RunResult:
         if self.rig is None:
             return None
         recording = self.recording
-        found = estimated_rig(self.rig, self.estimates[-1], recording.camera, str(recording.path))
+        given = self.rig
+        if self.repair.readout_s:
+            given = replace(given, readout_s=self.repair.readout_s)
+        found = estimated_rig(given, self.estimates[-1], recording.camera, str(recording.path))
         turn = self.repair.turn
         if turn is None:
             return found
-        return found.with_turned(np.array(turn), self.rig)
+        return found.with_turned(np.array(turn), given)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -206,14 +212,17 @@ def run(
                 return what.process(repair)
             except _BeginAgainError as found:
                 repair = found.repair
+                if found.others:
+                    log.warning("warnings so far are of images that are put right now; forget them")
 
 
 class _BeginAgainError(Exception):
-    """The first frames show what is wrong with all right images."""
+    """The first frames show what is wrong with all images."""
 
-    def __init__(self, repair: Repair) -> None:
-        super().__init__(f"right images are put right: {repair}")
+    def __init__(self, repair: Repair, others: int) -> None:
+        super().__init__(f"images are put right: {repair}")
         self.repair = repair
+        self.others = others  # findings so far, beside those on what is put right
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +245,7 @@ class _Run:
         return self.parts == CONFIGURED and self.map is None and not self.control.resume
 
     def process(self, repair: Repair) -> RunResult:
-        """Process the recording, its right images put right."""
+        """Process the recording, its images put right."""
         return _process(self, repair)
 
 
@@ -244,7 +253,7 @@ def _process(what: _Run, repair: Repair) -> RunResult:
     """Process a recording; see `run`.
 
     Raises:
-        _BeginAgainError: the run is to begin again with right images put right.
+        _BeginAgainError: the run is to begin again with images put right.
     """
     dataset = what.dataset
     config = what.config
@@ -256,7 +265,8 @@ def _process(what: _Run, repair: Repair) -> RunResult:
     control = what.control
     recording = dataset.recording
     folder = control.folder
-    source = replace(recorded_source(dataset, config), right_delay=repair.delay)
+    source = recorded_source(dataset, config)
+    source = replace(source, right_delay=repair.delay, readout_s=repair.readout_s)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
     began = time.perf_counter()
     recorder = RunRecorder(
@@ -396,7 +406,7 @@ class _RunState:
     # numbers of frames that the recording lists and did not give
     unread: list[int] = field(default_factory=list)
     sample_ns: int | None = None  # newest time of a motion sample that was taken
-    repair: Repair = AS_READ  # of the recording's right images
+    repair: Repair = AS_READ  # of the recording's images
 
     def not_taken(self, events: Iterable[Event]) -> Iterator[Event]:
         """Yield the events of a recording that is read again which were not taken before."""
@@ -517,7 +527,8 @@ class _Loop:
     def _take_results(self, results: list[FrameResult]) -> None:
         monitor = self._state.processor.pipeline.monitor
         if monitor.ends_at_repair and monitor.repair != self._state.repair:
-            raise _BeginAgainError(monitor.repair)
+            known = len(self._state.repair.lines()) + 1
+            raise _BeginAgainError(monitor.repair, len(monitor.findings) - known)
         if results:
             self._record(results)
 

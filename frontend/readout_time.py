@@ -1,0 +1,264 @@
+"""How long a camera takes from the exposure of its first row to that of its last, by its changes of
+velocity.
+
+Where all rows are exposed at once, the features of three frames fit a constant acceleration. A
+rolling shutter shows a feature, by the share s of its row, after the middle one, of the readout
+time r, at the velocity of another moment: beside the middle frame's pixels, those of a frame that is
+a time t away are off by `r s` times the change of velocity since then, equation (F3). What a steady
+velocity shows of r is left out, as errors of lenses, rows and depths show alike.
+Reference: Oth, Furgale, Kneip & Siegwart, Rolling shutter camera calibration, CVPR (2013).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from vio.cameras.rig import MAX_READOUT_S, Rectifier
+from vio.findings import Finder, Finding
+from vio.geometry.lie import FloatArray, circledot
+from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
+from vio.numerics.compiled import move_poses
+from vio.numerics.kinds import Tolerance
+from vio.records import NS_PER_S, IntArray, Observations, shared_rows
+
+
+class _ReadoutRules(NamedTuple):
+    """When the shutter is taken for a rolling one."""
+
+    min_features: int = 30  # that three frames share, with depth
+    max_features: int = 80  # of them that are used, before a rolling shutter shows
+    steps: int = 2  # of Gauss-Newton, from what three frames before have shown
+    longest_s: float = 0.3  # between two frames
+    least_motion_px: float = 0.5  # of the features, median, in three frames; fewer show nothing
+    least_px: float = 0.02  # error of a pixel, at least
+    triples: int = 8  # of frames, before anything is decided
+    passes: int = 2  # of as many, each linearised at what the last one has shown
+    precise: float = 0.03  # of the readout time, as a standard deviation
+    certain: float = 6.0  # standard deviations
+    least_s: float = 2e-3  # shorter readout times count as none
+    sigma_s: float = 0.5e-3  # as precise as that, it is known, and a shorter one is none for good
+    # after so many looks at every other frame, and at every fifth, every tenth is enough
+    often: tuple[int, int] = (20, 40)
+
+
+_RULES = _ReadoutRules()
+MIN_DEPTH_M: Tolerance[float] = 0.05  # of points moved by a velocity that is not fitted yet
+
+
+class RowShares:
+    """When pixels are exposed: their raw row's share of the image, after the middle one."""
+
+    def __init__(self, camera: StereoCamera, rectifier: Rectifier | None) -> None:
+        """Prepare for a rectified camera; `rectifier` of its raw images, if they are rectified here."""
+        self._rows: tuple[IntArray | None, ...] = (None, None)
+        heights = (camera.height, camera.height)
+        if rectifier is not None:
+            last = len(rectifier.cameras) - 1  # virtual right pixels are of the only camera
+            self._rows = (rectifier.rows(0), rectifier.rows(last))
+            heights = (rectifier.cameras[0].height, rectifier.cameras[last].height)
+        self._heights = tuple(int(height or 0) for height in heights)
+
+    @property
+    def known(self) -> bool:
+        """Whether the height of the images is."""
+        return 0 not in self._heights
+
+    def of(self, z: FloatArray) -> FloatArray:
+        """Shares (N, 2) of the left and the right pixels (N, 4), -0.5 to 0.5; arbitrary where a
+        pixel is.
+        """
+        shares = np.empty((len(z), 2))
+        for camera, (raw, height) in enumerate(zip(self._rows, self._heights, strict=True)):
+            rows = z[:, 2 * camera + 1]
+            if raw is not None:
+                pixels = np.nan_to_num(z[:, 2 * camera : 2 * camera + 2])
+                u, v = np.rint(pixels).astype(np.int64).T
+                rows = raw[np.clip(v, 0, len(raw) - 1), np.clip(u, 0, raw.shape[1] - 1)]
+            shares[:, camera] = (rows - 0.5 * (height - 1)) / height
+        return shares
+
+
+class _Three(NamedTuple):
+    """What three frames show: features of the middle one, and where the others show them."""
+
+    points: FloatArray  # (2 N, 3) in the middle frame, twice
+    share: FloatArray  # (2 N,) of their rows there
+    z: FloatArray  # (2 N, 3) pixels [ul vl ur] in the first, then in the last frame
+    there: FloatArray  # (2 N,) shares of their rows
+    time_s: FloatArray  # (2 N,) of those frames, after the middle one
+
+
+class ReadoutTime(Finder):
+    """Learns the readout time of a camera whose calibration states none."""
+
+    def __init__(self, camera: StereoCamera, shares: RowShares) -> None:
+        """Prepare for frames of a rectified camera, whose heights are known."""
+        super().__init__()
+        self._camera = camera
+        self._shares = shares
+        self._frames: list[Observations] = []  # the last ones
+        self._waits = 0  # frames before three are looked at again
+        self._looked = 0
+        self._sums: FloatArray = np.zeros(4)  # number, w, w r, w r^2
+        self._motion: FloatArray = np.zeros(12)  # the last velocity and acceleration
+        self._near_s = 0.0  # that equations are linearised at
+        self._passes = 0
+        self._open = camera.kind != "mono" and shares.known
+        self.readout_s = 0.0  # as far as known; it is of use once `is_rolling`
+        self.is_rolling = False
+
+    def frame(self, seen: Observations) -> None:
+        """Take the features of the next frame as the camera shows them."""
+        if not self._open:
+            return
+        self._frames = [*self._frames[-2:], seen]
+        self._waits -= 1
+        if self._waits > 0 or len(self._frames) < 3:
+            return
+        three = self._three(*self._frames)
+        if three is None:
+            return
+        often, seldom = _RULES.often
+        near = self._passes or self._looked < often
+        self._waits = 2 if near else 5 if self._looked < seldom else 10
+        self._looked += 1
+        self._add(three)
+        self._decide(seen)
+
+    def _three(
+        self, first: Observations, middle: Observations, last: Observations
+    ) -> _Three | None:
+        """What three frames show; None: too little."""
+        time_s = np.array([first.time_ns - middle.time_ns, last.time_ns - middle.time_ns])
+        time_s = time_s / NS_PER_S
+        if np.abs(time_s).max() > _RULES.longest_s:
+            return None
+        rows = np.full((2, len(middle)), -1)
+        use = middle.has_right & ~middle.stale
+        for k, other in enumerate((first, last)):
+            mine, theirs = shared_rows(middle.ids, other.ids)
+            good = other.has_right[theirs] & ~other.stale[theirs]
+            rows[k, mine[good]] = theirs[good]
+            use &= rows[k] >= 0
+        points, has_depth = triangulate(
+            self._camera, middle.z[use], min_disparity_px=DEPTH_DISPARITY_PX
+        )
+        chosen = use.nonzero()[0][has_depth]
+        if len(chosen) < _RULES.min_features:
+            return None
+        every = 1 if self._passes else -(-len(chosen) // _RULES.max_features)
+        chosen = chosen[::every]
+        before, after = (x.z[rows[k, chosen]] for k, x in enumerate((first, last)))
+        if np.median(np.abs(after[:, :2] - before[:, :2]).max(axis=1)) < _RULES.least_motion_px:
+            return None
+        z = np.concatenate((before, after))
+        return _Three(
+            np.tile(points[has_depth][::every], (2, 1)),
+            np.tile(self._shares.of(middle.z[chosen])[:, 0], 2),
+            z[:, :3],
+            self._shares.of(z)[:, 0],
+            time_s.repeat(len(chosen)),
+        )
+
+    def _add(self, three: _Three) -> None:
+        """Add the readout time that three frames show, with their velocity and acceleration."""
+        motion = self._motion
+        near_s = self._near_s
+        for _ in range(_RULES.steps):
+            normal, gradient, variance = _equations(self._camera, three, motion, near_s)
+            try:
+                solved = np.linalg.solve(
+                    normal[:12, :12], np.stack((gradient[:12], normal[:12, 12]), axis=1)
+                )
+            except np.linalg.LinAlgError:
+                return
+            motion = motion + solved[:, 0]
+        if not np.isfinite(motion).all():
+            self._motion = np.zeros(12)
+            return
+        self._motion = motion
+        information = normal[12, 12] - normal[12, :12] @ solved[:, 1]
+        if not information > 0.0:
+            return
+        readout_s = near_s + (gradient[12] - normal[12, :12] @ solved[:, 0]) / information
+        weight = information / variance
+        self._sums += [1.0, weight, weight * readout_s, weight * readout_s**2]
+
+    def _decide(self, seen: Observations) -> None:
+        """Tell a rolling shutter, or that there is none, where that is certain."""
+        count, weight, product, squares = self._sums.tolist()
+        if count < _RULES.triples:
+            return
+        self.readout_s = found_s = product / weight
+        scatter = max((squares - product * found_s) / (count - 1.0), 1.0)
+        sigma_s = math.sqrt(scatter / weight)
+        step_s = (seen.time_ns - self._frames[-2].time_ns) / NS_PER_S
+        possible = _RULES.least_s < abs(found_s) < min(1.2 * step_s, MAX_READOUT_S)
+        if not (possible and abs(found_s) > _RULES.certain * sigma_s):
+            self._open = sigma_s > _RULES.sigma_s or abs(found_s) > _RULES.least_s
+            return
+        if self._passes < _RULES.passes:  # as the equations are not linear
+            self._passes += 1
+            self._near_s = found_s
+            self._sums[:] = 0.0
+            return
+        if sigma_s > max(_RULES.sigma_s, _RULES.precise * abs(found_s)):
+            return
+        self.is_rolling = True
+        self._open = False
+        figures = {"readout_ms": 1e3 * found_s, "sigma_ms": 1e3 * sigma_s}
+        first = "first" if found_s > 0.0 else "last"
+        message = (
+            f"frame {seen.frame_index}: the shutter rolls, by how features move where the velocity "
+            f"changes: rows are exposed one after the other, from the {first} one on, within "
+            f"{1e3 * abs(found_s):.1f} +/- {1e3 * sigma_s:.1f} ms; features are moved to the time of "
+            f"the middle row from here on; set frontend.readout_ms to {1e3 * found_s:.1f}"
+        )
+        self._found.append(
+            Finding("rolling-shutter", message, seen.frame_index, 0, figures=figures)
+        )
+
+
+def moved_by(p: FloatArray, twists: FloatArray) -> FloatArray:
+    """Points (N, 3) after their own twists (N, 6)."""
+    T = np.tile(np.eye(4), (len(p), 1, 1))
+    move_poses(twists, T)
+    out: FloatArray = (T[:, :3, :3] @ p[:, :, None])[:, :, 0] + T[:, :3, 3]
+    return out
+
+
+def _equations(
+    camera: StereoCamera, three: _Three, motion: FloatArray, readout_s: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Normal equations, (13, 13) and (13,), of velocity and acceleration of the points (12,) and of
+    the readout time, with Cauchy's weights, and the variance of a pixel, px^2.
+    """
+    from_s = readout_s * three.share
+    to_s = three.time_s + readout_s * three.there
+    by_velocity = to_s - from_s
+    by_acceleration = 0.5 * (to_s**2 - from_s**2)
+    there = moved_by(
+        three.points,
+        by_velocity[:, None] * motion[:6] + by_acceleration[:, None] * motion[6:],
+    )
+    there[:, 2] = np.maximum(there[:, 2], MIN_DEPTH_M)
+    r = three.z - project(camera, there)[:, :3]
+    by_twist = z_D_p_cam(camera, there)[:, :3] @ circledot(there)[:, :3]
+    J = np.empty((len(r), 3, 13))
+    J[:, :, :6] = by_velocity[:, None, None] * by_twist
+    J[:, :, 6:12] = by_acceleration[:, None, None] * by_twist
+    slope = to_s * three.there - from_s * three.share
+    J[:, :, 12] = slope[:, None] * (by_twist @ motion[6:])
+    squared = (r * r).sum(axis=1)
+    squared = squared[: len(r) // 2] + squared[len(r) // 2 :]  # a feature counts in both or in none
+    weight = 1.0 / (1.0 + squared / max(float(np.median(squared)), 6.0 * _RULES.least_px**2))
+    weighted = (J * np.tile(weight, 2)[:, None, None]).reshape(-1, 13)
+    variance = float((weight * squared).sum() / (6.0 * weight.sum()))
+    return (
+        weighted.T @ J.reshape(-1, 13),
+        weighted.T @ r.reshape(-1),
+        max(variance, _RULES.least_px**2),
+    )
