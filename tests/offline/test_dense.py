@@ -269,6 +269,26 @@ def test_refusals_are_one_line(
         assert message in refused(capsys, "mesh", *arguments)
 
 
+def test_another_recording_of_the_same_rig_is_refused(
+    run_folder: Path, flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other"
+    assert main(["convert", str(flight), "--to", "plain", "--out", str(other)]) == 0
+    same = ["mesh", run_folder, "--source", other, "--voxel", "0.1"]
+    assert json_of(capsys, *same, "--out", tmp_path / "mesh")["triangles"] > 100
+    times = [float(line) for line in (other / "times.txt").read_text().split()]
+    (other / "times.txt").write_text("".join(f"{time + 0.5:.9f}\n" for time in times))
+    message = refused(capsys, *map(str, same), "--out", str(tmp_path / "none"))
+    assert "is another recording than that of the run" in message
+
+
+def test_voxels_as_large_as_the_scene_are_to_be_smaller(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["mesh", str(run_folder), "--out", str(tmp_path / "m"), "--voxel", "50"]
+    assert "with voxels of 50 m; give smaller ones" in refused(capsys, *arguments)
+
+
 def test_exports_keep_the_colours_of_the_images(flight: Path, tmp_path: Path) -> None:
     """The same flight with images that are tinted: exported in colour, the points too."""
     tinted = tmp_path / "flight"

@@ -10,7 +10,6 @@ part are decided on apart, by truncated least squares with graduated non-convexi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -134,7 +133,7 @@ def georeference(
             f"only {int(inside.sum())} GNSS positions ({spans[0]}) are within the trajectory "
             f"({spans[1]}); give "
             "those of this drive, or the offset of the clocks with --time-offset"
-            f"{epoch_hint(*_spans(path.times_ns, own_ns), 'the positions')}"
+            f"{epoch_hint(_span(path.times_ns), _span(own_ns), 'the positions')}"
         )
     frame = LocalFrame(fixes.geodetic[int(np.argmax(inside))].copy())
     measured = frame.enu(fixes.geodetic)[inside]
@@ -180,9 +179,8 @@ def georeference(
     )
 
 
-def _spans(*streams: IntArray) -> Iterator[tuple[int, int]]:
-    for times_ns in streams:
-        yield int(times_ns[0]), int(times_ns[-1])
+def _span(times_ns: IntArray) -> tuple[int, int]:
+    return int(times_ns[0]), int(times_ns[-1])
 
 
 def _check_extents(
