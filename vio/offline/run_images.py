@@ -26,7 +26,8 @@ from vio.protocols import Dataset
 from vio.records import FIELD_TERMS, ROW_TERMS, IntArray, StereoFrame
 from vio.runs.files import RunFile
 
-_MAX_APART_NS = 1_000_000  # of a frame's time from the run's: other forms of a recording round it
+_DATED_NS = 630_000_000_000_000_000  # 1990: later times are dates, and tell recordings apart
+_MAX_APART_NS = 1_000_000_000  # of a frame's time from the run's: features may be of another sensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,8 @@ class RunImages:
         for frame in _chosen(shown, indices.tolist(), self.repair):
             assert frame.left is not None
             own_ns = times_ns.get(frame.index, frame.time_ns)
-            if abs(frame.time_ns - own_ns) > _MAX_APART_NS:
+            dated = min(frame.time_ns, own_ns) > _DATED_NS
+            if dated and abs(frame.time_ns - own_ns) > _MAX_APART_NS:
                 raise DataError(
                     f"{dataset.recording.path} is another recording than that of the run {self.where}: "
                     f"frame {frame.index} is of {1e-9 * frame.time_ns:.3f} s, the run's of "
