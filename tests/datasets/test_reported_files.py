@@ -133,6 +133,8 @@ def test_lists_of_times_are_read(form: str, tmp_path: Path) -> None:
         ("images", lambda side, k: f"{('left', 'right')[side]}{k:02d}.png"),
         ("images", lambda side, k: f"frame{k:04d}_cam{side}.png"),
         (".", lambda side, k: f"{k}-{'LR'[side]}.png"),
+        # the Málaga dataset's
+        ("Images", lambda side, k: f"img_CAMERA1_{k}.918590_{('left', 'right')[side]}.png"),
     ],
 )
 def test_both_cameras_in_one_folder_are_a_pair(

@@ -8,6 +8,7 @@ import errno
 import functools
 import http.server
 import itertools
+import re
 import sys
 import threading
 import time
@@ -46,6 +47,7 @@ from vio.sources.source import (
     Layout,
     SourceEvent,
     SourceFrame,
+    layout_hint,
     open_source,
 )
 
@@ -238,7 +240,15 @@ def test_a_stream_over_the_network_has_times_of_arrival_and_its_end_is_named(
     [
         ("nonsense", ConfigError, "is no live source; give one of v4l2:, video:"),
         ("v4l2:/dev/video_none", DataError, "there is no such device; video devices are"),
-        ("video:nowhere.mp4", DataError, "OpenCV cannot open it"),
+        ("v4l2:99", DataError, "/dev/video99: there is no such device"),
+        ("video:nowhere.mp4", DataError, "OpenCV cannot open it; there is no such file"),
+        (f"video:{__file__}", DataError, "OpenCV cannot open it; check that it is a video"),
+        ("http://127.0.0.1:9/a", DataError, "check address, user and password"),
+        ("0", ConfigError, r"did you mean v4l2:0\?"),
+        ("/dev/video0", ConfigError, r"did you mean v4l2:/dev/video0\?"),
+        (__file__, ConfigError, r"did you mean video:.*test_sources.py\?"),
+        ("oak", ConfigError, r"did you mean oak:\?"),
+        ("v4l2src ! appsink", ConfigError, "pipelines of GStreamer are not taken"),
     ],
 )
 def test_absent_sources_are_named(name: str, error: type[Exception], message: str) -> None:
@@ -281,6 +291,42 @@ def test_the_source_states_the_size_that_a_calibration_lacks(
     options = ["--calibration", str(tmp_path / "calib.txt"), "--drop", "none"]
     assert main(["live", f"video:{video}", *options]) == 0
     assert "16 frames with a pose, 0 left out; latency" in capsys.readouterr().out
+
+
+def test_no_frame_of_a_file_is_left_out(
+    video: Path, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["live", f"video:{video}", "--calibration", str(flight)]) == 0
+    assert "16 frames with a pose, 0 left out" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("layout", "half", "words"),
+    [
+        (
+            "side-by-side",
+            (320, 480),
+            "each image side-by-side in it 320x480, .* that of one camera",
+        ),
+        ("side-by-side", (320, 960), "640x480; give --layout top-bottom"),
+        ("top-bottom", (1280, 240), "640x480; give --layout side-by-side"),
+        ("single", (1280, 480), "give --layout side-by-side"),
+        ("side-by-side", (320, 240), "let the camera send that size"),
+        ("side-by-side", (644, 480), "check that calibration and camera belong together"),
+    ],
+)
+def test_images_of_another_size_say_which_layout_fits(
+    layout: Layout, half: tuple[int, int], words: str
+) -> None:
+    assert re.search(words, layout_hint(layout, half, (640, 480)))
+
+
+def test_a_picture_of_one_camera_is_not_halved(
+    video: Path, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--calibration", str(flight), "--layout", "top-bottom"]
+    assert main(["live", f"video:{video}", *options]) == 1
+    assert "give --layout side-by-side" in capsys.readouterr().err
 
 
 def test_what_a_run_needs_is_named(

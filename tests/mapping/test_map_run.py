@@ -237,7 +237,7 @@ def test_maps_are_shown_and_merged(
     assert main(["map", "merge", str(path), str(tmp_path / "other.map"), "--out", str(lost)]) == 1
     assert f"{lost}: its folder {lost.parent} does not exist" in capsys.readouterr().err
     assert main(["map", "show", str(tmp_path)]) == 1
-    assert "is a folder; name a file" in capsys.readouterr().err
+    assert "is a folder; a map is one file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -254,7 +254,8 @@ def test_a_merge_of_two_rigs_names_files_that_the_user_knows(
     store.close()
     with pytest.raises(DataError, match="shows no place of"):
         merge_maps(tmp_path / "a.map", tmp_path / "b.map", tmp_path / "both.map")
-    assert f"{tmp_path / 'both.map'}: was made with another rig" in caplog.text
+    assert f"{tmp_path / 'a.map'}: was made with another rig" in caplog.text
+    assert f"{tmp_path / 'b.map'} is of a stereo pair" in caplog.text
     assert "partial" not in caplog.text
 
 
@@ -274,7 +275,7 @@ def test_a_truncated_map_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_map_that_cannot_be_made_says_why(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="is a folder; name a file"):
+    with pytest.raises(DataError, match="is a folder; a map is one file"):
         MapStore(tmp_path, create=True)
     with pytest.raises(DataError, match=r"its folder .*nowhere does not exist"):
         MapStore(tmp_path / "nowhere" / "a.map", create=True)

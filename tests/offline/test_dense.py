@@ -269,6 +269,37 @@ def test_refusals_are_one_line(
         assert message in refused(capsys, "mesh", *arguments)
 
 
+def _dated(flight: Path, out: Path, start_s: int) -> Path:
+    """Convert a flight to a plain folder without an IMU, whose times are dates from a start on."""
+    assert main(["convert", str(flight), "--to", "plain", "--out", str(out)]) == 0
+    (out / "imu.csv").unlink()
+    count = len((out / "times.txt").read_text().split())
+    times = [f"{start_s + k // 20}.{50 * (k % 20):03d}\n" for k in range(count)]
+    (out / "times.txt").write_text("".join(times))
+    return out
+
+
+def test_another_recording_of_the_same_rig_is_refused(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = _dated(flight, tmp_path / "first", 1_700_000_000)
+    other = _dated(flight, tmp_path / "other", 1_700_000_100)
+    run = tmp_path / "run"
+    assert main(["run", str(first), "--out", str(run), "--quiet"]) == 0
+    mesh = ["mesh", str(run), "--voxel", "0.1", "--out", str(tmp_path / "mesh")]
+    assert "is another recording than that of the run" in refused(
+        capsys, *mesh, "--source", str(other)
+    )
+    assert json_of(capsys, *mesh, "--source", str(first))["triangles"] > 100
+
+
+def test_voxels_as_large_as_the_scene_are_to_be_smaller(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["mesh", str(run_folder), "--out", str(tmp_path / "m"), "--voxel", "50"]
+    assert "with voxels of 50 m; give smaller ones" in refused(capsys, *arguments)
+
+
 def test_exports_keep_the_colours_of_the_images(flight: Path, tmp_path: Path) -> None:
     """The same flight with images that are tinted: exported in colour, the points too."""
     tinted = tmp_path / "flight"

@@ -282,6 +282,9 @@ def test_rows_without_a_position_are_skipped_and_counted(tmp_path: Path) -> None
         ("0,49,8\n", "3 values instead of 7"),
         ("0,49,8,1\n1,nan,nan,1,2\n", "line 1"),
         ("0,nan,nan,1\n", "holds no position"),
+        ("0,0,0,0\n", "holds no position"),
+        ("0,489800000,83900000,115000\n", "divide receivers' 1e-7 degrees"),
+        ("time,lat,lon,alt,vn,ve,vd\n0,49,8,1,0,0,0\n", "has the columns time,lat"),
         ("", "holds no line of data"),
     ],
 )
@@ -289,6 +292,39 @@ def test_damaged_tables_are_named(tmp_path: Path, text: str, message: str) -> No
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(DataError, match=message):
         read_gnss(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(("unit", "step"), [(1e3, 1000), (1e6, 200_000), (1e9, 10**8)])
+def test_stamps_in_other_units_are_read(tmp_path: Path, unit: float, step: int) -> None:
+    (tmp_path / "a.csv").write_text("".join(f"{step * k},49,8,1\n" for k in range(20)))
+    fixes = read_gnss(tmp_path / "a.csv")
+    assert fixes.times_ns[1] == round(1e9 * step / unit)
+    assert [note for note in fixes.notes if "its times are taken for" in note]
+
+
+def test_a_header_may_name_longitude_first_and_zeros_are_no_fix(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("stamp,lng,lat,alt\n0,0,0,0\n1,8,49,2\n2,8,49.1,2\n")
+    fixes = read_gnss(tmp_path / "a.csv")
+    assert fixes.geodetic.tolist() == [[49, 8, 2], [49.1, 8, 2]]
+    assert fixes.notes[0].startswith("1 of 3 rows without a position")
+
+
+def test_positions_of_another_extent_are_refused() -> None:
+    drive = _drive(seed=0, poses=300)
+    fixes = drive.fixes
+    for geodetic, words in (
+        (np.radians(fixes.geodetic), "in radians"),
+        (fixes.geodetic[:, [1, 0, 2]] * [1, 3, 1], "latitude before longitude"),
+        (np.tile(fixes.geodetic[:1], (len(fixes), 1)), "those of this drive"),
+    ):
+        with pytest.raises(EstimationError, match=words):
+            georeference(drive.path, replace(fixes, geodetic=geodetic), LEVER_M)
+
+
+def test_clocks_that_usual_differences_explain_are_named() -> None:
+    drive = _drive(seed=0, poses=100)
+    with pytest.raises(EstimationError, match="18 s \\(GPS time and UTC\\)"):
+        georeference(drive.path, drive.fixes, LEVER_M, time_offset_ns=18 * 10**9)
 
 
 def test_reads_kitti_oxts(tmp_path: Path) -> None:

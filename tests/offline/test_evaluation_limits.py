@@ -278,7 +278,7 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
         0.011,
     ),
     "earth: attitudes": (lambda x: _turn_of_fit(x) < 0.5, 90.0, 110.0),
-    "file: norm": (lambda x: not _pose_is_read(1.0 + x), 0.9e-3, 1.1e-3),
+    "file: norm": (lambda x: not _pose_is_read(1.0 + x), 0.019, 0.021),
     "file: rotation": (lambda x: not _matrix_is_read(x), 0.9e-3, 1.1e-3),
     "file: far": (lambda x: not _pose_is_read(metres=x), 0.9e12, 1.1e12),
     "file: frames": (lambda n: not _frames_are_listed(int(n)), 100, 101),

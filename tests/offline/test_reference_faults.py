@@ -76,6 +76,72 @@ def test_inverse_poses_are_named() -> None:
     assert not [note for note in evaluate(alone, _trajectory()).notes if "inverted" in note]
 
 
+def test_an_inverse_reference_in_another_world_is_named() -> None:
+    # of a world whose origin is far from the estimate's, as a laboratory's is
+    T_lab_world = se3_from_parts(so3_exp(np.array([0.0, 0.0, 2.0])), np.array([3.0, -4.0, 1.0]))
+    truth = _trajectory()
+    inverse = replace(truth, T_world_body=se3_inverse(T_lab_world @ truth.T_world_body))
+    notes = evaluate(_odometry(1.02, 1e-4, 0.02), inverse).notes
+    assert len([note for note in notes if "poses of the reference are inverted" in note]) == 1
+
+
+def _holding(moves: bool) -> tuple[Trajectory, Trajectory]:
+    """Truth and odometry of which the truth holds its pose over a quarter; the body moves or not."""
+    truth = _trajectory()
+    poses = truth.T_world_body.copy()
+    poses[200:300] = poses[199]
+    held = replace(truth, T_world_body=poses)
+    if moves:
+        estimate = _odometry(1.0, 1e-4, 0.02)
+    else:
+        noise = 0.02 * np.random.default_rng(1).standard_normal((COUNT, 3))
+        estimate = replace(
+            held, T_world_body=se3_from_parts(poses[:, :3, :3], poses[:, :3, 3] + noise)
+        )
+    return estimate, held
+
+
+def test_a_reference_that_holds_its_last_pose_is_named() -> None:
+    notes = evaluate(*_holding(moves=True)).notes
+    (note,) = (note for note in notes if "repeat the one before to the bit" in note)
+    assert note.startswith("100 positions of the reference")
+
+
+def test_a_body_at_rest_holds_no_pose() -> None:
+    assert not [note for note in evaluate(*_holding(moves=False)).notes if "to the bit" in note]
+
+
+def test_milliseconds_in_decimals_are_named() -> None:
+    own = (300_000_000, 6_200_000_000)
+    assert "in ms: state" in epoch_hint(own, (300_000_000_000, 6_200_000_000_000), "the reference")
+    assert "in us: state" in epoch_hint(own, (300_000 * 10**9, 6_200_000 * 10**9), "the reference")
+    # the reference of a day, and one of another hour
+    assert "in ms" not in epoch_hint(own, (10**10, 86_400 * 10**9), "the reference")
+    assert "in ms" not in epoch_hint(own, (3600 * 10**9, 3606 * 10**9), "the reference")
+
+
+def test_times_that_count_are_named() -> None:
+    truth = _trajectory()
+    counted = replace(truth, times_ns=10**9 * np.arange(COUNT, dtype=np.int64))
+    estimate = replace(truth, times_ns=50_000_000 * np.arange(COUNT, dtype=np.int64))
+    (note,) = (n for n in evaluate(estimate, counted).notes if n.startswith("only 20 poses match"))
+    assert "the times of the reference count by one" in note
+
+
+def test_rounded_quaternions_are_read_and_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = [(0.1 * k, 0, 0, 0, 0.0, 0.0, 0.38, 0.93) for k in range(5)]  # norm 1.0046
+    np.savetxt(tmp_path / "two.txt", rows)
+    read = read_trajectory(tmp_path / "two.txt")
+    angle = np.arctan2(read.T_world_body[0, 1, 0], read.T_world_body[0, 0, 0])
+    assert angle == pytest.approx(2 * np.arctan2(0.38, 0.93), abs=1e-12)
+    assert "with too few digits" in caplog.text
+    np.savetxt(tmp_path / "one.txt", [(*row[:7], 0.95) for row in rows])
+    with pytest.raises(DataError, match=r"norm 1\.023"):
+        read_trajectory(tmp_path / "one.txt")
+
+
 def _moved(trajectory: Trajectory, arm: FloatArray) -> Trajectory:
     """The same motion of another point of the body, with other axes."""
     T_body_point = se3_from_parts(so3_exp(np.array([0.0, 0.0, np.pi / 2])), arm)

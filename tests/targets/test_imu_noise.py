@@ -72,6 +72,59 @@ def test_says_what_to_record(tmp_path: Path) -> None:
         measure_noise(ImuRecord(record.times_ns[gap], record.gyro[gap], record.accel[gap]))
 
 
+@pytest.mark.parametrize(
+    ("gyro", "accel", "words"),
+    [
+        (1.0, 1 / 9.80665, "its unit seems to be g"),
+        (1.0, 1000 / 9.80665, "its unit seems to be mg"),
+        (1.0, 0.5, "state its unit in a header"),
+        (0.0, 1.0, "gyro x are all the same"),
+    ],
+)
+def test_readings_in_other_units_are_refused(gyro: float, accel: float, words: str) -> None:
+    record = _record(400)
+    with pytest.raises(DataError, match=words):
+        measure_noise(ImuRecord(record.times_ns, gyro * record.gyro, accel * record.accel))
+
+
+def test_gravity_in_another_place_is_named() -> None:
+    record = _record(400)
+    with pytest.raises(DataError, match="the gyro's columns show it"):
+        measure_noise(ImuRecord(record.times_ns, record.accel, record.gyro))
+    with pytest.raises(DataError, match="linear acceleration"):
+        measure_noise(ImuRecord(record.times_ns, record.gyro, record.accel - [0, 0, 9.81]))
+
+
+def test_copies_and_knocks_are_not_called_motion() -> None:
+    record = _record(400)
+    held = np.arange(len(record.times_ns)) // 2 * 2
+    with pytest.raises(DataError, match="50 % of the samples repeat"):
+        measure_noise(ImuRecord(record.times_ns, record.gyro[held], record.accel[held]))
+    record.gyro[10_010, 1] += 5
+    with pytest.raises(DataError, match=r"gyro y shows .* at second 200\.20"):
+        measure_noise(record)
+
+
+def test_what_the_densities_are_not_is_noted() -> None:
+    record = _record(1200)
+    assert measure_noise(record).notes == ()
+    turned = measure_noise(ImuRecord(record.times_ns, np.degrees(record.gyro), record.accel))
+    assert [note for note in turned.notes if "in deg/s, state that" in note]
+    seconds = 1e-9 * record.times_ns
+    warm = record.gyro + np.outer(seconds / seconds[-1], [0.0, 0.01, 0.0])
+    (note,) = measure_noise(ImuRecord(record.times_ns, warm, record.accel)).notes
+    assert note.startswith("gyro y drifts steadily, by +0.0")
+    shaken = record.accel + 0.3 * np.sin(2 * np.pi * 11.3 * seconds)[:, None] * [0, 0, 1]
+    noise = measure_noise(ImuRecord(record.times_ns, record.gyro, shaken))
+    assert [note for note in noise.notes if note.startswith("accel z is ")]
+    assert noise.accel.walk.value > 0
+
+
+@pytest.mark.parametrize("seed", range(1, 7))
+def test_healthy_records_have_no_notes(seed: int) -> None:
+    assert measure_noise(_record(900, seed)).notes == ()
+
+
 def test_the_command_writes_kalibrs_file(tmp_path: Path) -> None:
     record = _record(400)
     rows = np.column_stack([record.gyro, record.accel])

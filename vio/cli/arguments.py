@@ -113,7 +113,9 @@ def add_map_arguments(parser: argparse.ArgumentParser) -> None:
         help="with --out, also write the log of features",
     )
     parser.add_argument(
-        "--drop", choices=("oldest", "none", "block"), default="oldest", help="of frames that wait"
+        "--drop",
+        choices=("oldest", "none", "block"),
+        help="of frames that wait (default oldest, and block of a file)",
     )
 
 

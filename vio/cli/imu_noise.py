@@ -43,7 +43,9 @@ def execute(args: argparse.Namespace) -> int:
         there = next((str(table) for table in tables if table.is_file()), "its imu.csv")
         raise DataError(f"{args.imu}: is a folder; give the table of IMU samples: {there}")
     check_writable(args.out)
-    noise = measure_noise(read_imu_table(args.imu)[0])
+    record, notes = read_imu_table(args.imu)
+    noise = measure_noise(record)
+    notes += noise.notes
     at_rest = noise.densities
     moving = ImuDensities(
         MOVING_FACTOR * at_rest.gyro,
@@ -60,10 +62,12 @@ def execute(args: argparse.Namespace) -> int:
         "accel": asdict(noise.accel),
         "moving_factor": MOVING_FACTOR,
         "out": str(args.out),
+        "notes": list(notes),
     }
     rows = [
         *_rows("gyro", noise.gyro, "rad/s"),
         *_rows("accel", noise.accel, "m/s^2"),
+        *(("note", note) for note in notes),
         ("written", f"{args.out}: {MOVING_FACTOR:g} times as much, for use while moving"),
     ]
     return print_result(facts, rows, as_json=args.json, name_width=20)

@@ -71,9 +71,11 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from vio.datasets.rigs import load_rig
+    from vio.errors import CalibrationError
     from vio.sources.run import LiveOptions, run_source
-    from vio.sources.source import open_source
+    from vio.sources.source import is_recorded, layout_hint, open_source
 
+    args.drop = args.drop or ("block" if is_recorded(args.source) else "oldest")
     if args.target is not None:
         return _film_board(args)
     config = config_from(args)
@@ -89,6 +91,9 @@ def execute(args: argparse.Namespace) -> int:
                 image_size=source.image_size,
                 cameras=1 if args.layout == "single" else 2,
             )
+            size = (rig.cam0.width, rig.cam0.height)
+            if source.image_size is not None and source.image_size != size:
+                raise CalibrationError(layout_hint(args.layout, source.image_size, size))
     except VioError:
         source.close()
         raise
@@ -150,7 +155,7 @@ def _film_board(args: argparse.Namespace) -> int:
             say=lambda line: print(line, file=sys.stderr, flush=True),
             record=args.record,
             record_as=args.record_as,
-            every_frame=args.drop == "none",
+            every_frame=args.drop != "oldest",
         )
     print(lacks)
     if args.record is None:

@@ -90,7 +90,7 @@ def execute(args: argparse.Namespace) -> int:
         FrameNames(*names),
         args.prefix.rstrip("/"),
         "reliable" if args.reliable else "sensor",
-        args.drop,
+        args.drop or "oldest",
         not args.no_tf,
         kept_from(args, " ".join(topics.kinds)),
         map_use,

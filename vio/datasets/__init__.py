@@ -231,9 +231,9 @@ def _folder_kind(path: Path) -> str | None:
         raise DataError(f"{path} is empty; give {_looked_for()}")
     if "metrics.json" in names and "config.yaml" in names:
         raise DataError(
-            f"{path} holds the results of a run, not a recording; show it with vio report, compare "
-            "it by vio eval, or "
-            "give its observations.npz (of --save-observations)"
+            f"{path} holds the results of a run, not a recording; its poses are in trajectory.tum; show "
+            "it with vio report, compare it by vio eval, or give its observations.npz (of "
+            "--save-observations)"
         )
     kind = _kind_of_folder(path)
     if kind is None and "sequences" in names:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +14,13 @@ from vio.datasets.bags.store import Bag
 from vio.datasets.gnss_fixes import UP_SHARE, GnssFixes, checked_fixes
 from vio.datasets.tables import drive_times, read_table, stamps_ns
 from vio.errors import DataError
+from vio.files.stamps import Pace
 from vio.files.text import check_increasing, text_lines
 
 _FORM = "time_s,latitude_deg,longitude_deg,height_m,sigma_east_m,sigma_north_m,sigma_up_m"
+_SIGMA_WORDS = ("sigma", "std", "sd", "dev", "acc", "err")
+# steps of receivers, whose stamps may be in ms, us or ns
+_FIX_PACE = Pace("positions", 5e-3, 15.0, 5e-3)
 _OXTS_COLUMNS = 30
 _OXTS_ACCURACY = 23  # column of pos_accuracy, m
 _OXTS_MIN_M = 0.02
@@ -46,19 +52,36 @@ def _read_csv(path: Path) -> GnssFixes:
     """Read a table with or without the standard deviations; empty or NaN: not known."""
     columns = 4 if _width_of_last_row(path) == 4 else 7
     table = read_table(path, columns, _FORM)
-    if table.header and not all(
-        word in name for word, name in zip(("time", "lat", "lon"), table.header, strict=False)
-    ):
-        raise DataError(f"{path}: has the columns {','.join(table.header)}; expected {_FORM}")
     values = table.values
+    if table.header:
+        order = _order(table.header)
+        if order is None:
+            raise DataError(f"{path}: has the columns {','.join(table.header)}; expected {_FORM}")
+        values = values[:, [*order, *range(2, columns - 1)]]
     if columns == 7:
         sigmas = values[:, 3:].copy()
     else:
         sigmas = np.full((len(values), 3), np.nan)
     no_up = np.isnan(sigmas[:, 2])
     sigmas[no_up, 2] = UP_SHARE * sigmas[no_up, :2].max(axis=1)
-    times_ns = check_increasing(stamps_ns(table), table.where)
-    return checked_fixes(times_ns, values[:, :3], np.eye(3) * sigmas[:, None, :] ** 2, str(path))
+    notes = list[str]()
+    times_ns = check_increasing(stamps_ns(table, _FIX_PACE, notes), table.where)
+    covariance = np.eye(3) * sigmas[:, None, :] ** 2
+    return checked_fixes(times_ns, values[:, :3], covariance, str(path), tuple(notes))
+
+
+def _order(header: Sequence[str]) -> tuple[int, int] | None:
+    """Return which columns behind the stamp are latitude and longitude, by a header whose further
+    columns are height and standard deviations; None: it names others.
+    """
+    if len(header) < 3 or not re.search("time|stamp|^t$", header[0]):
+        return None
+    if any(not any(word in name for word in _SIGMA_WORDS) for name in header[4:]):
+        return None
+    for order in ((0, 1), (1, 0)):
+        if "lat" in header[1 + order[0]] and re.search("lon|lng", header[1 + order[1]]):
+            return order
+    return None
 
 
 def _width_of_last_row(path: Path) -> int:

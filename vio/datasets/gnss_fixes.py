@@ -8,11 +8,13 @@ import numpy as np
 
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
+from vio.numerics.kinds import Tolerance
 from vio.records import BoolArray, IntArray
 
 SIGMA_M = 3.0  # horizontal, where nothing states it: a receiver without corrections under open sky
 UP_SHARE = 2.0  # of a vertical standard deviation to a horizontal one, likewise
 _MIN_SIGMA_M = 0.01
+_NO_DEGREES: Tolerance[float] = 1e-9
 _HEIGHTS_M = (-1000.0, 50_000.0)
 
 
@@ -56,9 +58,10 @@ def checked_fixes(
         C = np.full((len(order), 3, 3), np.nan)
     else:
         C = covariance[order]
-    keep = np.isfinite(geodetic[:, :2]).all(axis=1) & np.concatenate(
-        [[True], np.diff(times_ns) > 0]
-    )
+    # receivers write 0, 0 while they have no fix
+    nowhere = (np.abs(geodetic[:, :2]) < _NO_DEGREES).all(axis=1)
+    stated = np.isfinite(geodetic[:, :2]).all(axis=1) & ~nowhere
+    keep = stated & np.concatenate([[True], np.diff(times_ns) > 0])
     if not keep.any():
         raise DataError(f"{where}: holds no position; give a record with a fix")
     notes += (
@@ -69,12 +72,12 @@ def checked_fixes(
     geodetic = geodetic[keep].copy()
     C = C[keep].copy()
     outside = (np.abs(geodetic[:, 0]) > 90) | (np.abs(geodetic[:, 1]) > 360)
-    if outside.any() or (np.abs(geodetic[:, :2]) < 1e-9).all():
+    if outside.any():
         lat, lon = geodetic[int(np.argmax(outside)), :2]
         raise DataError(
             f"{where}: {lat:g}, {lon:g} is no latitude and longitude in degrees; give positions in "
-            "WGS84 (convert "
-            "those of another datum or projection first)"
+            "WGS84 (divide receivers' 1e-7 degrees by 1e7, convert NMEA's ddmm.mmmm, and those of "
+            "another datum or projection, first)"
         )
     has_height = (
         np.isfinite(geodetic[:, 2])

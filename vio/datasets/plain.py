@@ -85,7 +85,7 @@ _PAIRS: tuple[tuple[str, ...], ...] = (
     ("undistorted_images/cam0", "undistorted_images/cam1"),
 )  # fmt: skip
 ALONE = (
-    "left", "Left", "cam0", "image_0", "image_00", "image", "images", "img", "rgb", "color", "mono",
+    "left", "Left", "cam0", "image_0", "image_00", "image", "images", "Images", "img", "rgb", "color", "mono",
 )  # fmt: skip
 _GRAY = (0, 1)  # of KITTI
 _COLOUR = (2, 3)

@@ -89,20 +89,30 @@ def split_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
 
 
 def _frame_and_side(name: str) -> tuple[tuple[str, ...], str] | None:
-    """Return the words of an image's name but the first that names a side, and this side."""
+    """Return the words of an image's name but the first that names a side, and this side.
+
+    A word does before the number of a camera, which may be that of a stereo camera
+    (`img_CAMERA1_17_left`).
+    """
     words = words_of(os.path.splitext(name)[0])
-    for k in range(len(words)):
-        side = _side_at(words, k)
-        if side is not None:
-            return (*words[:k], "", *words[k + 1 :]), side
+    for side_at in (_side_of_word, _side_of_camera):
+        for k in range(len(words)):
+            side = side_at(words, k)
+            if side is not None:
+                return (*words[:k], "", *words[k + 1 :]), side
     return None
 
 
-def _side_at(words: tuple[str, ...], k: int) -> str | None:
+def _side_of_word(words: tuple[str, ...], k: int) -> str | None:
     """Return the side that a word of a name states; None: it states none."""
     for left, right in _SIDES[:3]:
         if words[k] in (left, right):
             return "left" if words[k] == left else "right"
+    return None
+
+
+def _side_of_camera(words: tuple[str, ...], k: int) -> str | None:
+    """Return the side that the number of a camera in a name states; None: it states none."""
     if not k or words[k] not in ("0", "1"):
         return None
     counted = words[k + 1 : k + 2] and words[k + 1].isdigit()  # image_0_17: camera, number

@@ -18,6 +18,7 @@ from scipy.sparse import coo_matrix, csc_matrix
 from vio.datasets.gnss_fixes import GnssFixes
 from vio.earth.geodesy import LocalFrame
 from vio.errors import EstimationError
+from vio.files.epochs import epoch_hint
 from vio.geometry.lie import (
     FloatArray,
     se3_adjoint,
@@ -51,6 +52,10 @@ class _AlignmentRules:
     settled: Tolerance[float] = 1e-5
     start_steps: Tolerance[int] = 20  # of the robust alignment that it starts from
     min_fixes: int = 3
+    max_extents: float = 1.25  # of the spreads of positions and trajectory: beyond, they are others
+    extent_sigmas: float = 3.0  # of a position along an axis, by which the spreads must differ, too
+    # of the spread of radians as degrees, times 57; that of longitudes is larger beside the equator
+    of_radians: tuple[float, float] = (0.8, 2.2)
     height_sigma_m: float = 1e3  # of the first pose, where no position states a height
     metre_per_rad: float = 100.0  # weights a turn of a pose against its position in the rigid fit
 
@@ -128,6 +133,7 @@ def georeference(
             f"only {int(inside.sum())} GNSS positions ({spans[0]}) are within the trajectory "
             f"({spans[1]}); give "
             "those of this drive, or the offset of the clocks with --time-offset"
+            f"{epoch_hint(_span(path.times_ns), _span(own_ns), 'the positions')}"
         )
     frame = LocalFrame(fixes.geodetic[int(np.argmax(inside))].copy())
     measured = frame.enu(fixes.geodetic)[inside]
@@ -139,6 +145,9 @@ def georeference(
         fixes.has_height[inside],
     )
     problem = _Problem(path, *of_fixes, lever_arm_m)
+    _check_extents(
+        measured, problem.antenna(path.T_map_body), path.up_map, fixes.covariance[inside]
+    )
     T, log_scale, weight = problem.solve()
     normal = problem.factorised(T, log_scale, weight)
     used, used_height = (np.zeros(len(fixes), dtype=np.bool_) for _ in range(2))
@@ -168,6 +177,42 @@ def georeference(
         inside=inside,
         residuals=residuals,
     )
+
+
+def _span(times_ns: IntArray) -> tuple[int, int]:
+    return int(times_ns[0]), int(times_ns[-1])
+
+
+def _check_extents(
+    measured: FloatArray, antenna: FloatArray, up_map: FloatArray, covariance: FloatArray
+) -> None:
+    """Raise EstimationError where positions (N, 3) spread over another length than the trajectory's
+    antenna (N, 3) does in its map, by more than their noise.
+    """
+    level = antenna - np.outer(antenna @ up_map, up_map)
+    own_m, gnss_m = (_spread_m(points) for points in (level, measured[:, :2]))
+    sigma_m = float(np.sqrt(np.median(np.trace(covariance[:, :2, :2], axis1=1, axis2=2)) / 2))
+    ratio = gnss_m / max(own_m, 1e-12)
+    apart = max(ratio, 1 / max(ratio, 1e-12)) > _ALIGNMENT.max_extents
+    if not apart or abs(gnss_m - own_m) < _ALIGNMENT.extent_sigmas * sigma_m:
+        return
+    low, high = _ALIGNMENT.of_radians
+    if low < ratio * np.degrees(1.0) < high:
+        why = "they seem to be in radians: give degrees"
+    else:
+        why = (
+            "give those of this drive, in degrees, latitude before longitude; a trajectory of one camera "
+            "alone, or of a wrong baseline, has another scale"
+        )
+    raise EstimationError(
+        f"the GNSS positions spread over {gnss_m:.3g} m (median from their middle) and the trajectory at "
+        f"these times over {own_m:.3g} m; {why}"
+    )
+
+
+def _spread_m(points: FloatArray) -> float:
+    """Return the median distance of points (N, K) from their median."""
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
 def _span_text(times_ns: IntArray) -> str:

@@ -1,6 +1,6 @@
 """What makes the positions of a reference differ from an estimate of the same motion: a clock that
-is apart, axes that are left-handed, inverse poses, poses that are placeholders, another point of the
-body.
+is apart, axes that are left-handed, inverse poses, poses that are placeholders or held, another
+point of the body.
 """
 
 from __future__ import annotations
@@ -69,14 +69,39 @@ def position_fault(
             "simulators; change the sign of one of them"
         )
     if "none" not in (estimate.orientations, reference.orientations):
-        inverse_m = float(_errors(se3_inverse(T_est)[:, :3, 3], y)[0])
-        if inverse_m < _FAULT.explained * error_m:
+        inverted = {
+            "estimate": float(_errors(se3_inverse(T_est)[:, :3, 3], y)[0]),
+            "reference": float(_errors(x, se3_inverse(T_ref)[:, :3, 3])[0]),
+        }
+        fits = [name for name, left_m in inverted.items() if left_m < _FAULT.explained * error_m]
+        if fits:
+            which = f"the {fits[0]}" if len(fits) == 1 else "one of the two"
             return (
-                "the positions agree where the poses of one of the two are inverted (ATE after Sim(3) "
-                f"{inverse_m:.3g} m, {error_m:.3g} m without): one file has the world in the body, as "
-                "some programs write, and the other the body in the world; invert its poses"
+                f"the positions agree where the poses of {which} are inverted (ATE after Sim(3) "
+                f"{min(inverted.values()):.3g} m, {error_m:.3g} m without): one file has the world in "
+                "the body, as some programs write, and the other the body in the world; invert its "
+                "poses"
             )
-    return _clock_fault(estimate, reference)
+    return _held_fault(x, y, error_m) or _clock_fault(estimate, reference)
+
+
+def _held_fault(x: FloatArray, y: FloatArray, error_m: float) -> str | None:
+    """Return the note on positions y (M, 3) of a reference that repeat the one before to the bit;
+    None: there are none, or they explain nothing of the error.
+
+    A body at rest repeats them as well, and then they agree.
+    """
+    held = np.concatenate([[False], (y[1:] == y[:-1]).all(axis=1)])
+    if not held.any() or len(y) - held.sum() < _FAULT.min_poses:
+        return None
+    left_m = float(_errors(x, y[None], ~held[None])[0])
+    if not left_m < _FAULT.explained * error_m:
+        return None
+    return (
+        f"{held.sum()} positions of the reference repeat the one before to the bit while the estimate "
+        f"moves (ATE after Sim(3) {left_m:.3g} m without them, {error_m:.3g} m with): it holds its last "
+        "pose where it lost the body; remove these rows"
+    )
 
 
 def lever_arm_note(T_est: FloatArray, T_ref: FloatArray) -> str | None:

@@ -40,7 +40,7 @@ from vio.evaluation.quaternion_order import settled_orders
 from vio.evaluation.reference_axes import attitude_note
 from vio.evaluation.reference_faults import lever_arm_note, position_fault
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
-from vio.records import BodyFrame, IntArray, Trajectory
+from vio.records import NS_PER_S, BodyFrame, IntArray, Trajectory
 
 
 class _WordingRules(NamedTuple):
@@ -398,10 +398,21 @@ def _notes(
     if len(rows) < _SUSPECT.matched_share * shorter:
         notes.append(
             f"only {len(rows)} poses match, of {len(estimate)} of the estimate and "
-            f"{len(reference)} of the reference; "
-            "is it the reference of this recording, on the same clock?"
+            f"{len(reference)} of the reference; {_counted(estimate, reference)}"
         )
     return tuple(notes)
+
+
+def _counted(estimate: Trajectory, reference: Trajectory) -> str:
+    """Return why few poses match: times that count, or a clock or recording of its own."""
+    for name, trajectory in (("estimate", estimate), ("reference", reference)):
+        times_ns = trajectory.times_ns
+        if times_ns is not None and (np.diff(times_ns) == NS_PER_S).all():
+            return (
+                f"the times of the {name} count by one, as numbers of frames do: give it with times "
+                "(TUM form)"
+            )
+    return "is it the reference of this recording, on the same clock?"
 
 
 def _row_note(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:

@@ -230,9 +230,8 @@ def check_new_file(path: Path, sign: bytes | None = None) -> None:
     with _writing(path):
         ours = sign is not None and path.is_file() and sign in path.read_bytes()
     if not ours:
-        raise DataError(
-            f"{path} exists and was not made by this command; remove it, or choose another name"
-        )
+        fault = "exists" if sign is None else "exists and was not made by this command"
+        raise DataError(f"{path} {fault}; remove it, or choose another name")
 
 
 @contextlib.contextmanager

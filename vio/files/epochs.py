@@ -1,4 +1,6 @@
-"""By how much usual clocks differ: leap seconds, time zones, and clocks that start with a device."""
+"""By how much usual clocks differ: leap seconds, time zones, units, and clocks that start with a
+device.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ from typing import NamedTuple
 
 from vio.records import NS_PER_S
 
+_UNITS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # of times that were read as seconds
 # seconds by which one clock is ahead of another, since 2017
 _LEAP_SECONDS = {18: "GPS time and UTC", 37: "TAI and UTC", 19: "TAI and GPS time"}
 
@@ -17,6 +20,8 @@ class _EpochRules(NamedTuple):
     max_hours: int = 14  # of a time zone
     # s: whole hours explain any difference of longer spans
     max_span_s: float = 1800.0
+    # of the longer span over the shorter one, where a unit explains it
+    alike_spans: float = 3.0
     # s: a clock that begins with its device, and one that counts from 1970 (after 1990)
     since_start_s: float = 1e8
     since_1970_s: float = 6.3e8
@@ -41,6 +46,15 @@ def epoch_hint(own_ns: tuple[int, int], other_ns: tuple[int, int], other: str) -
             f"; the times of {other} count from the start of a device or of the recording, not from "
             "1970"
         )
+    for unit, factor in _UNITS.items():
+        scaled = (round(factor * other_ns[0]), round(factor * other_ns[1]))
+        spans = sorted(last - first for first, last in (own_ns, scaled))
+        alike = 0 < spans[1] < _EPOCHS.alike_spans * spans[0]
+        if alike and _share_of_overlap(own_ns, scaled, 0) >= _EPOCHS.overlap:
+            return (
+                f"; they would overlap if the times of {other} were in {unit}: state the unit in a "
+                f"header, as '# time [{unit}]'"
+            )
     span_s = min(last - first for first, last in (own_ns, other_ns)) / NS_PER_S
     hours = {3600 * h: "time zones" for h in range(1, _EPOCHS.max_hours + 1)}
     known = _LEAP_SECONDS | (hours if span_s < _EPOCHS.max_span_s else {})

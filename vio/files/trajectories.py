@@ -57,6 +57,7 @@ class _PoseRules(NamedTuple):
 
     max_coordinate_m: float = 1e12  # of a coordinate, in metres: beyond, squares overflow
     max_frame_number: int = 10_000_000  # whole numbers beyond are times
+    rounded_norm: float = 0.02  # from one, of quaternions with two decimals
     exact_deviation: Tolerance[float] = 1e-12  # rotations this close to orthonormal keep their bits
 
 
@@ -547,7 +548,17 @@ def _quaternion_poses(
             "remove such lines",
         )
     norm = np.linalg.norm(q_xyzw, axis=1)
-    bad = np.abs(norm - 1) > ROTATION_TOLERANCE
+    off = np.abs(norm - 1)
+    bad = off > _POSES.rounded_norm
+    if not bad.any() and (off > ROTATION_TOLERANCE).any():
+        logger.warning(
+            "%s: quaternions have norms of %.4g to %.4g, as with too few digits: attitudes are off by some "
+            "%.1g deg",
+            table.path,
+            norm.min(),
+            norm.max(),
+            4 * np.degrees(off.max()),
+        )
     if bad.any():
         row = int(np.argmax(bad))
         table.fail(

@@ -69,23 +69,37 @@ def check_camera(path: Path, camera: StereoCamera) -> None:
         )
 
 
-def check_sessions(store: MapStore, camera: StereoCamera) -> None:
+def check_sessions(
+    store: MapStore,
+    camera: StereoCamera,
+    what: str = "this recording",
+    *,
+    place: Path | None = None,
+) -> None:
     """Warn where a map was made with another rig; raise DataError where with another kind of
     camera.
+
+    Args:
+        store: the map.
+        camera: of what is looked for in it.
+        what: that, for messages.
+        place: the map's file, for messages; None: that of the store.
     """
+    place = place or store.path
     others = [s.camera for s in store.sessions()]
     for other in others:
         if (other.projection, other.kind) != _ONLY:
             raise DataError(
-                f"{store.path}: is a map of {_text(other)}; use another map for {_text(camera)}"
+                f"{place}: is a map of {_text(other)}; use another map for {_text(camera)}"
             )
     if others and not any(_is_alike(other, camera) for other in others):
         log.warning(
-            "%s: was made with another rig, %s; this recording is of %s: places are looked for all "
+            "%s: was made with another rig, %s; %s is of %s: places are looked for all "
             "the same, and if "
             "this is the same rig, one of the calibrations is wrong",
-            store.path,
+            place,
             _text(others[-1]),
+            what,
             _text(camera),
         )
 

@@ -94,9 +94,12 @@ _Row = TypeVar("_Row")
 
 def check_path(path: Path) -> None:
     """Raise DataError where a map's file can neither be nor be made."""
-    if path.is_dir() or not path.absolute().parent.is_dir():
-        fault = "is a folder" if path.is_dir() else f"its folder {path.parent} does not exist"
-        raise DataError(f"{path}: {fault}; name a file in a folder that exists")
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder; a map is one file, which vio run --map FILE makes")
+    if not path.absolute().parent.is_dir():
+        raise DataError(
+            f"{path}: its folder {path.parent} does not exist; name a file in a folder that exists"
+        )
 
 
 @contextlib.contextmanager

@@ -81,7 +81,7 @@ def merge_maps(first: Path, second: Path, out: Path, *, workers: int = 1) -> dic
                     "vio map drop takes a session out of one"
                 )
             before = len(store.keyframes())
-            _append(other, store)
+            _append(other, store, first)
             if not _Merge(store, before).join(written, workers):
                 raise DataError(
                     f"{second}: shows no place of {first}; keep two maps, or record a way between "
@@ -110,8 +110,8 @@ def _begin(path: Path) -> tuple[Any, ...]:
         )
 
 
-def _append(other: MapStore, store: MapStore) -> None:
-    """Add all that a map holds to another one, in parts of its own."""
+def _append(other: MapStore, store: MapStore, first: Path) -> None:
+    """Add all that a map holds to another one, a copy of the first, in parts of its own."""
     sessions = len(store.sessions())
     rows = store.keyframes()
     loops = other.loops()
@@ -119,7 +119,7 @@ def _append(other: MapStore, store: MapStore) -> None:
         (rows[-1].drift + UNKNOWN * np.eye(6), rows[-1].path_m) if rows else (np.zeros((6, 6)), 0.0)
     )
     for session in other.sessions():
-        check_sessions(store, session.camera)
+        check_sessions(store, session.camera, f"{other.path}", place=first)
         store.add_session(replace(session, part=session.part + sessions))
     for k, row in enumerate(other.keyframes()):
         moved = replace(

@@ -37,6 +37,7 @@ class _MeshRules:
     step_share: float = 0.02
     step_deg: float = 4.0
     near_quantile: float = 0.25  # of the depths of landmarks
+    coarse_share: float = 0.1  # of the landmarks' depth: larger voxels show no surface
     # z of the upward direction, 1.1 degrees, above which a map's z is taken for up
     level: float = 0.9998
 
@@ -55,6 +56,7 @@ class MeshSource:
     poses: str  # where the poses are from, for the results
     up_world: FloatArray | None  # (3,)
     voxel_m: float
+    depth_m: float  # of the landmarks
 
     @property
     def far_m(self) -> float:
@@ -128,7 +130,9 @@ def mesh_source(folder: Path, map_file: Path | None, voxel_m: float | None) -> M
     else:
         up = up_in(T, T_odom, up_odom)
     poses = "map" if mapped or map_file is not None else "odometry"
-    return MeshSource(images, T[chosen], trajectory.frame_indices[chosen], poses, up, voxel_m)
+    return MeshSource(
+        images, T[chosen], trajectory.frame_indices[chosen], poses, up, voxel_m, depth_m
+    )
 
 
 def build_mesh(
@@ -171,10 +175,11 @@ def build_mesh(
         mesh = extract_surface(grid, least_seen=min(done, 3))
         blocks = len(grid)
     if not len(mesh.triangles):
+        coarse = voxel_m > _DEPTHS.coarse_share * made_from.depth_m
         raise DataError(
             f"{images.where}: no surface was found within {made_from.far_m:.1f} m in {done} "
-            "images; give larger "
-            "voxels with --voxel, and see whether the run's poses are right"
+            f"images with voxels of {voxel_m:g} m; give {'smaller' if coarse else 'larger'} ones with "
+            "--voxel, and see whether the run's poses are right"
         )
     R = upright_axes(made_from.T_world_cam0, made_from.up_world)
     if made_from.up_world is not None and made_from.up_world[2] > _DEPTHS.level:

@@ -16,6 +16,7 @@ from vio.datasets import DatasetSettings, in_colour, open_dataset
 from vio.datasets.common import read_npz
 from vio.datasets.image_pairs import ImageDataset
 from vio.errors import DataError
+from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import rig_from_rectified
 from vio.geometry.lie import FloatArray
 from vio.geometry.rectify import pinhole_maps, pinhole_within
@@ -24,6 +25,9 @@ from vio.guard.repairing import AS_READ, Repair, repaired
 from vio.protocols import Dataset
 from vio.records import FIELD_TERMS, ROW_TERMS, IntArray, StereoFrame
 from vio.runs.files import RunFile
+
+_DATED_NS = 630_000_000_000_000_000  # 1990: later times are dates, and tell recordings apart
+_MAX_APART_NS = 1_000_000_000  # of a frame's time from the run's: features may be of another sensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +54,23 @@ class RunImages:
             colour: keep the images' colours, (H, W, 3).
 
         Raises:
-            DataError: the recording is missing, has no images or another camera, or a frame cannot
-                be read.
+            DataError: the recording is missing, has no images or another camera, is another one by
+                the times of its frames, or a frame cannot be read.
         """
         dataset = self._opened(source)
+        times_ns = self._times_ns()
         correct = self._correction(dataset.recording.camera)
         shown = in_colour(dataset) if colour else dataset
         for frame in _chosen(shown, indices.tolist(), self.repair):
             assert frame.left is not None
+            own_ns = times_ns.get(frame.index, frame.time_ns)
+            dated = min(frame.time_ns, own_ns) > _DATED_NS
+            if dated and abs(frame.time_ns - own_ns) > _MAX_APART_NS:
+                raise DataError(
+                    f"{dataset.recording.path} is another recording than that of the run {self.where}: "
+                    f"frame {frame.index} is of {1e-9 * frame.time_ns:.3f} s, the run's of "
+                    f"{1e-9 * own_ns:.3f} s; name the run's with --source"
+                )
             if correct is None:
                 yield frame
             elif frame.right is None:
@@ -69,6 +82,16 @@ class RunImages:
             else:
                 left, right = correct(frame.left, frame.right)
                 yield replace(frame, left=left, right=right)
+
+    def _times_ns(self) -> dict[int, int]:
+        """Return the times of the run's frames, by their numbers; none where it states none."""
+        file = self.where / RunFile.TRAJECTORY
+        if not file.is_file():
+            return {}
+        run = read_trajectory(file)
+        if run.times_ns is None or run.frame_indices is None:
+            return {}
+        return dict(zip(run.frame_indices.tolist(), run.times_ns.tolist(), strict=True))
 
     def _opened(self, source: str | None) -> Dataset:
         file = self.where / RunFile.CONFIG

@@ -213,7 +213,7 @@ def check_clear(world: World, positions: npt.ArrayLike, what: str = "the camera"
         raise SimulationError(
             f"{what} leaves the {world.name} at position {i} of {len(p)}, ({_metres(p[i])}) m; it "
             f"spans ({_metres(world.bounds[0])}) to ({_metres(world.bounds[1])}) m: "
-            "choose a larger scene or another trajectory"
+            "choose a larger scene, such as street, or another trajectory"
         )
     for number, solid in enumerate(world.solids):
         local = (p - solid.T_world_box[:3, 3]) @ solid.T_world_box[:3, :3]

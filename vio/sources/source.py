@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Literal, Protocol, TypeAlias
 
 from vio.cameras.rig import Rig
@@ -63,6 +64,59 @@ SOURCES = {
 }
 
 
+def is_recorded(name: str) -> bool:
+    """Tell whether a source is a file, which gives its frames as fast as they are taken."""
+    scheme, _, rest = name.partition(":")
+    return scheme in ("video", "realsense") and Path(rest).is_file()
+
+
+def layout_hint(layout: Layout, half: tuple[int, int], size: tuple[int, int]) -> str:
+    """Return why the images of a video have another width and height than a calibration.
+
+    Args:
+        layout: by which the picture was taken apart.
+        half: of an image.
+        size: of the calibration.
+    """
+    across, down = {"side-by-side": (2, 1), "top-bottom": (1, 2), "single": (1, 1)}[layout]
+    whole = (across * half[0], down * half[1])
+    text = f"the picture is {whole[0]}x{whole[1]} pixels"
+    if layout != "single":
+        text += f", and each image {layout} in it {half[0]}x{half[1]}"
+    wanted = {
+        "side-by-side": (2 * size[0], size[1]),
+        "top-bottom": (size[0], 2 * size[1]),
+        "single": size,
+    }
+    other = next((name for name, needs in wanted.items() if needs == whole), None)
+    if other == "single":
+        why = "it is that of one camera: give --layout single, with an IMU, or the camera that sends both"
+    elif other is not None:
+        why = f"give --layout {other}"
+    elif half[0] * size[1] == half[1] * size[0]:
+        why = "let the camera send that size, or give the calibration of this one"
+    else:
+        why = "check that calibration and camera belong together, and --layout"
+    return f"{text}, but the calibration is for {size[0]}x{size[1]}; {why}"
+
+
+def _no_source(name: str) -> ConfigError:
+    """Return the error for a name without a kind of source, with the name that may be meant."""
+    known = f"give one of {', '.join(f'{scheme}:' for scheme in SOURCES)}"
+    path = Path(name)
+    if name.isdigit() or name.startswith("/dev/video"):
+        known = f"did you mean v4l2:{name}?"
+    elif path.is_dir():
+        known = f"is it a recording: vio run {name}?"
+    elif path.is_file():
+        known = f"did you mean video:{name}?"
+    elif name in SOURCES:
+        known = f"did you mean {name}:?"
+    elif " ! " in name:
+        known += "; pipelines of GStreamer are not taken: let one send rtsp: or udp:"
+    return ConfigError(f"{name!r} is no live source; {known}")
+
+
 def open_source(name: str, layout: Layout = "side-by-side") -> LiveSource:
     """Open a source by its name.
 
@@ -78,9 +132,7 @@ def open_source(name: str, layout: Layout = "side-by-side") -> LiveSource:
     """
     scheme, colon, rest = name.partition(":")
     if not colon or scheme not in SOURCES:
-        raise ConfigError(
-            f"{name!r} is no live source; give one of {', '.join(f'{known}:' for known in SOURCES)}"
-        )
+        raise _no_source(name)
     module, kind = SOURCES[scheme].split(":")
     made: Callable[..., LiveSource] = getattr(import_module(f"vio.sources.{module}"), kind)
     if module == "video":

@@ -43,19 +43,27 @@ class VideoSource:
         self._layout = layout
         self._is_file = Path(name).is_file()
         device = name.isdigit() or name.startswith("/dev/")
-        if device and not name.isdigit() and not Path(name).exists():
+        path = Path(f"/dev/video{name}" if name.isdigit() else name)
+        if device and not path.exists():
             have = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*"))) or "none"
-            raise DataError(f"{name}: there is no such device; video devices are: {have}")
+            raise DataError(f"{path}: there is no such device; video devices are: {have}")
         where = int(name) if name.isdigit() else name
         if device:
             self._video = cv2.VideoCapture(where, cv2.CAP_V4L2)
         else:
             self._video = cv2.VideoCapture(where)
         if not self._video.isOpened():
-            raise DataError(
-                f"{name}: OpenCV cannot open it; check the name, and that no other program uses it"
-            )
+            raise DataError(f"{name}: OpenCV cannot open it; {self._remedy(path, device=device)}")
         self.image_size = self._size_of_a_half()
+
+    def _remedy(self, path: Path, *, device: bool) -> str:
+        if device:
+            return "check that it is a camera, and that no other program uses it"
+        if self._is_file:
+            return "check that it is a video, and play it with another program"
+        if "://" in self._name:
+            return "check address, user and password, and that the camera sends"
+        return "it is a folder" if path.is_dir() else "there is no such file"
 
     def _size_of_a_half(self) -> tuple[int, int] | None:
         """Return width and height of one image as the video states them; None: it does not."""
