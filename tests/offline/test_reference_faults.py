@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from vio.errors import DataError, EvaluationError
+from vio.evaluation import reference_faults
 from vio.evaluation.trajectories import evaluate
 from vio.files.epochs import epoch_hint
 from vio.files.trajectories import read_trajectory
@@ -57,6 +58,34 @@ def test_a_reference_of_another_clock_is_named(shift_s: float, words: str) -> No
     notes = evaluate(_odometry(1.02, 1e-4, 0.02), _trajectory(shift_s=shift_s)).notes
     assert [note for note in notes if words in note and "its clock is not the estimate's" in note]
     assert not [note for note in notes if "body with other axes" in note]
+
+
+@pytest.mark.parametrize("shift_s", [-0.1, 0.1])
+def test_a_clock_is_named_however_long_the_path(shift_s: float) -> None:
+    """0.1 s are 0.3 % of a path of a minute to and fro, whose estimate is right to millimetres."""
+    count = 1200
+    truth = _trajectory(count=count)
+    noisy = truth.T_world_body.copy()
+    noisy[:, :3, 3] += 0.003 * np.random.default_rng(5).standard_normal((count, 3))
+    estimate = replace(truth, T_world_body=noisy)
+    notes = evaluate(estimate, _trajectory(shift_s=shift_s, count=count)).notes
+    words = "0.100 s late" if shift_s > 0 else "0.100 s early"
+    assert [note for note in notes if words in note]
+    assert not [note for note in evaluate(estimate, truth).notes if "clock" in note]
+
+
+def test_an_antenna_ahead_of_a_car_is_no_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At a constant speed a point 1 m ahead is where the car is 0.1 s later: either explains it."""
+    times = 0.05 * np.arange(2400)
+    heading = 0.6 * np.sin(0.12 * times)
+    path = np.cumsum(0.5 * np.stack([np.cos(heading), np.sin(heading), 0 * heading], 1), axis=0)
+    R = so3_exp(np.stack([0 * heading, 0 * heading, heading], 1))
+    stamps = START_NS + np.round(1e9 * times).astype(np.int64)
+    reference = Trajectory(se3_from_parts(R, path), stamps, "imu")
+    ahead = _moved(reference, np.array([1.0, 0, 0]))
+    assert not [note for note in evaluate(reference, ahead).notes if "clock" in note]
+    monkeypatch.setattr(reference_faults, "_explaining_arm", lambda *_: None)
+    assert [note for note in evaluate(reference, ahead).notes if "clock" in note]
 
 
 def test_a_left_handed_reference_is_named() -> None:

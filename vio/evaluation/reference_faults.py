@@ -5,6 +5,7 @@ point of the body.
 
 from __future__ import annotations
 
+from collections.abc import Sized
 from typing import NamedTuple
 
 import numpy as np
@@ -19,11 +20,12 @@ from vio.records import NS_PER_S, BoolArray, IntArray, Trajectory
 class _FaultRules(NamedTuple):
     """When another clock, or another hand, explains the distances of positions."""
 
-    min_share: float = 0.005  # of the path, that the error must be before anything is looked for
+    min_share: float = 0.005  # of the path, that an error must be for other faults than a clock
     min_poses: int = 20
     max_poses: int = 500  # of a long record, evenly chosen
     explained: float = 0.33  # of the error, that may be left by what explains it
     max_shift_s: float = 40.0  # the 37 s between TAI and UTC, and the 18 s of GPS
+    clearly: float = 0.1  # likewise, of an error below min_share, by another clock
     overlap: float = 0.5  # share of the poses that must have a reference at a shift
     steps: int = 200  # of the first search, on either side
     finer: int = 10  # steps on either side of the best one, twice
@@ -39,11 +41,13 @@ _ROUNDING: Tolerance[float] = 1e-9  # of a reference's extent: errors below it a
 def position_fault(
     estimate: Trajectory, reference: Trajectory, T_est: FloatArray, T_ref: FloatArray
 ) -> str | None:
-    """Return what explains the distances between positions after an alignment with scale; None: they
-    are small, or nothing does.
+    """Return what explains the distances between positions after an alignment with scale; None:
+    nothing does, or they are small.
 
     A scale is part of every alignment here, as one that is off passes for a shift where a body
-    speeds up.
+    speeds up. A clock is looked for however small the distances are: those of a shift grow with the
+    speed, not with the path. Where they are small, it is not named if another point of the body
+    explains them as well, as on a car's front.
 
     Args:
         estimate: the whole trajectory.
@@ -60,7 +64,8 @@ def position_fault(
     path_m = path_length_m(y)
     error_m = float(_errors(x, y)[0])
     if not error_m > _FAULT.min_share * path_m:
-        return None
+        shifted = _clock_fault(estimate, reference, _FAULT.clearly)
+        return shifted if shifted is None or _explaining_arm(T_est, T_ref) is None else None
     mirrored_m = float(_errors(x, y * [-1.0, 1.0, 1.0])[0])
     if mirrored_m < _FAULT.explained * error_m:
         return (
@@ -82,7 +87,7 @@ def position_fault(
                 "the body, as some programs write, and the other the body in the world; invert its "
                 "poses"
             )
-    return _held_fault(x, y, error_m) or _clock_fault(estimate, reference)
+    return _held_fault(x, y, error_m) or _clock_fault(estimate, reference, _FAULT.explained)
 
 
 def _held_fault(x: FloatArray, y: FloatArray, error_m: float) -> str | None:
@@ -114,21 +119,11 @@ def lever_arm_note(T_est: FloatArray, T_ref: FloatArray) -> str | None:
         T_est: (M, 4, 4) poses that were paired, in the estimate's world.
         T_ref: (M, 4, 4) the poses of the reference.
     """
-    every = slice(None, None, -(-len(T_est) // _FAULT.max_poses))
-    T_est = T_est[every]
-    y = T_ref[every, :3, 3]
-    if len(y) < _FAULT.min_poses:
+    found = _explaining_arm(T_est, T_ref)
+    if found is None:
         return None
-    path_m = path_length_m(y)
-    arms = []
-    for scaled in (False, True):
-        start = align_poses(T_est, T_ref[every], "sim3" if scaled else "se3")
-        without_m, _ = _beside_arm(T_est, y, start, scaled=scaled, arm=False)
-        left_m, arm = _beside_arm(T_est, y, start, scaled=scaled, arm=True)
-        if not left_m < _FAULT.explained * without_m:
-            return None
-        arms.append((without_m, left_m, arm))
-    without_m, left_m, arm = arms[0]
+    without_m, left_m, arm = found
+    path_m = path_length_m(T_ref[:: _every(T_ref), :3, 3])
     length_m = float(np.linalg.norm(arm))
     if not (without_m > _FAULT.min_share * path_m and without_m < length_m < _FAULT.max_arm_m):
         return None
@@ -139,6 +134,31 @@ def lever_arm_note(T_est: FloatArray, T_ref: FloatArray) -> str | None:
         "as a camera, a prism or an antenna; move its poses by it, or ATE and scale are those of the "
         "distance"
     )
+
+
+def _explaining_arm(T_est: FloatArray, T_ref: FloatArray) -> tuple[float, float, FloatArray] | None:
+    """Return the distances, m, without a lever arm and with it, and the arm (3,), where it explains
+    them beside a scale as well; None: it does not.
+    """
+    every = _every(T_est)
+    T_est = T_est[::every]
+    y = T_ref[::every, :3, 3]
+    if len(y) < _FAULT.min_poses:
+        return None
+    arms = []
+    for scaled in (False, True):
+        start = align_poses(T_est, T_ref[::every], "sim3" if scaled else "se3")
+        without_m, _ = _beside_arm(T_est, y, start, scaled=scaled, arm=False)
+        left_m, arm = _beside_arm(T_est, y, start, scaled=scaled, arm=True)
+        if not left_m < _FAULT.explained * without_m:
+            return None
+        arms.append((without_m, left_m, arm))
+    return arms[0]
+
+
+def _every(poses: Sized) -> int:
+    """Return of how many poses one is used, so that there are `max_poses` at most."""
+    return -(-len(poses) // _FAULT.max_poses)
 
 
 def _beside_arm(
@@ -203,12 +223,14 @@ def _placeholders(estimate: Trajectory) -> str | None:
     )
 
 
-def _clock_fault(estimate: Trajectory, reference: Trajectory) -> str | None:
-    """Return the note on a reference whose clock is apart; None: no shift explains the error."""
+def _clock_fault(estimate: Trajectory, reference: Trajectory, explained: float) -> str | None:
+    """Return the note on a reference whose clock is apart; None: no shift leaves less than a share,
+    explained, of the error.
+    """
     if estimate.times_ns is None or reference.times_ns is None:
         return None
     start_ns = int(estimate.times_ns[0])
-    chosen = slice(None, None, -(-len(estimate) // _FAULT.max_poses))
+    chosen = slice(None, None, _every(estimate))
     times = (estimate.times_ns[chosen] - start_ns) / NS_PER_S
     known = (reference.times_ns - start_ns) / NS_PER_S
     span_s = min(float(np.ptp(times)), float(np.ptp(known)))
@@ -225,7 +247,7 @@ def _clock_fault(estimate: Trajectory, reference: Trajectory) -> str | None:
         shift_s = float(shifts[best])
         step_s /= _FAULT.finer
         count = _FAULT.finer
-    if not ratios[best] < _FAULT.explained or abs(shift_s) < _usual_step_s(estimate.times_ns) / 4:
+    if not ratios[best] < explained or abs(shift_s) < _usual_step_s(estimate.times_ns) / 4:
         return None
     way = "late" if shift_s > 0 else "early"
     return (
