@@ -28,16 +28,22 @@ from vio.records import NS_PER_S, IntArray, Observations, shared_rows
 class _ReadoutRules(NamedTuple):
     """When the shutter is taken for a rolling one."""
 
-    min_features: int = 30  # that three frames share, with depth
+    # Frames that are looked at together, at first and once a rolling shutter shows: three take a
+    # velocity for steady that changes fast, and the readout time for a tenth shorter.
+    coarse: int = 3
+    fine: int = 5
+    min_features: int = 30  # that they share, with depth
     max_features: int = 80  # of them that are used, before a rolling shutter shows
     steps: int = 2  # of Gauss-Newton, from what three frames before have shown
-    longest_s: float = 0.3  # between two frames
-    least_motion_px: float = 0.5  # of the features, median, in three frames; fewer show nothing
+    longest_s: float = 0.3  # from the middle frame
+    least_motion_px: float = 0.5  # of the features, median; fewer show nothing
     least_px: float = 0.02  # error of a pixel, at least
     triples: int = 8  # of frames, before anything is decided
     passes: int = 2  # of as many, each linearised at what the last one has shown
     precise: float = 0.03  # of the readout time, as a standard deviation
     certain: float = 6.0  # standard deviations
+    # of the readout time, by what it is off on six rendered rigs with usual errors
+    usual: float = 0.1
     least_s: float = 2e-3  # shorter readout times count as none
     sigma_s: float = 0.5e-3  # as precise as that, it is known, and a shorter one is none for good
     # after so many looks at every other frame, and at every fifth, every tenth is enough
@@ -81,14 +87,15 @@ class RowShares:
         return shares
 
 
-class _Three(NamedTuple):
-    """What three frames show: features of the middle one, and where the others show them."""
+class _Shown(NamedTuple):
+    """What frames show: N features of the middle one, and where the M others show them."""
 
-    points: FloatArray  # (2 N, 3) in the middle frame, twice
-    share: FloatArray  # (2 N,) of their rows there
-    z: FloatArray  # (2 N, 3) pixels [ul vl ur] in the first, then in the last frame
-    there: FloatArray  # (2 N,) shares of their rows
-    time_s: FloatArray  # (2 N,) of those frames, after the middle one
+    points: FloatArray  # (M N, 3) in the middle frame, as often as there are others
+    share: FloatArray  # (M N,) of their rows there
+    z: FloatArray  # (M N, 3) pixels [ul vl ur] in the others, one after the other
+    there: FloatArray  # (M N,) shares of their rows
+    time_s: FloatArray  # (M N,) of those frames, after the middle one
+    others: int
 
 
 class ReadoutTime(Finder):
@@ -103,7 +110,7 @@ class ReadoutTime(Finder):
         self._waits = 0  # frames before three are looked at again
         self._looked = 0
         self._sums: FloatArray = np.zeros(4)  # number, w, w r, w r^2
-        self._motion: FloatArray = np.zeros(12)  # the last velocity and acceleration
+        self._motion: FloatArray = np.zeros((2, 6))  # the last velocity, acceleration, ...
         self._near_s = 0.0  # that equations are linearised at
         self._passes = 0
         self._open = camera.kind != "mono" and shares.known
@@ -114,31 +121,30 @@ class ReadoutTime(Finder):
         """Take the features of the next frame as the camera shows them."""
         if not self._open:
             return
-        self._frames = [*self._frames[-2:], seen]
+        span = _RULES.fine if self._passes else _RULES.coarse
+        self._frames = [*self._frames[1 - _RULES.fine :], seen]
         self._waits -= 1
-        if self._waits > 0 or len(self._frames) < 3:
+        if self._waits > 0 or len(self._frames) < span:
             return
-        three = self._three(*self._frames)
-        if three is None:
+        shown = self._shown(self._frames[-span:])
+        if shown is None:
             return
         often, seldom = _RULES.often
         near = self._passes or self._looked < often
         self._waits = 2 if near else 5 if self._looked < seldom else 10
         self._looked += 1
-        self._add(three)
+        self._add(shown)
         self._decide(seen)
 
-    def _three(
-        self, first: Observations, middle: Observations, last: Observations
-    ) -> _Three | None:
-        """What three frames show; None: too little."""
-        time_s = np.array([first.time_ns - middle.time_ns, last.time_ns - middle.time_ns])
-        time_s = time_s / NS_PER_S
+    def _shown(self, frames: list[Observations]) -> _Shown | None:
+        """What frames show, an odd number of them; None: too little."""
+        middle = frames.pop(len(frames) // 2)
+        time_s = np.array([seen.time_ns - middle.time_ns for seen in frames]) / NS_PER_S
         if np.abs(time_s).max() > _RULES.longest_s:
             return None
-        rows = np.full((2, len(middle)), -1)
+        rows = np.full((len(frames), len(middle)), -1)
         use = middle.has_right & ~middle.stale
-        for k, other in enumerate((first, last)):
+        for k, other in enumerate(frames):
             mine, theirs = shared_rows(middle.ids, other.ids)
             good = other.has_right[theirs] & ~other.stale[theirs]
             rows[k, mine[good]] = theirs[good]
@@ -151,39 +157,42 @@ class ReadoutTime(Finder):
             return None
         every = 1 if self._passes else -(-len(chosen) // _RULES.max_features)
         chosen = chosen[::every]
-        before, after = (x.z[rows[k, chosen]] for k, x in enumerate((first, last)))
-        if np.median(np.abs(after[:, :2] - before[:, :2]).max(axis=1)) < _RULES.least_motion_px:
+        z = np.stack([seen.z[rows[k, chosen]] for k, seen in enumerate(frames)])
+        if np.median(np.abs(z[-1] - z[0])[:, :2].max(axis=1)) < _RULES.least_motion_px:
             return None
-        z = np.concatenate((before, after))
-        return _Three(
-            np.tile(points[has_depth][::every], (2, 1)),
-            np.tile(self._shares.of(middle.z[chosen])[:, 0], 2),
+        z = z.reshape(-1, 4)
+        return _Shown(
+            np.tile(points[has_depth][::every], (len(frames), 1)),
+            np.tile(self._shares.of(middle.z[chosen])[:, 0], len(frames)),
             z[:, :3],
             self._shares.of(z)[:, 0],
             time_s.repeat(len(chosen)),
+            len(frames),
         )
 
-    def _add(self, three: _Three) -> None:
-        """Add the readout time that three frames show, with their velocity and acceleration."""
-        motion = self._motion
+    def _add(self, shown: _Shown) -> None:
+        """Add the readout time that frames show, with their velocity and its derivatives."""
+        motion = np.zeros((shown.others, 6))
+        motion[:2] = self._motion[:2]
+        size = motion.size
         near_s = self._near_s
         for _ in range(_RULES.steps):
-            normal, gradient, variance = _equations(self._camera, three, motion, near_s)
+            normal, gradient, variance = _equations(self._camera, shown, motion, near_s)
             try:
                 solved = np.linalg.solve(
-                    normal[:12, :12], np.stack((gradient[:12], normal[:12, 12]), axis=1)
+                    normal[:size, :size], np.stack((gradient[:size], normal[:size, size]), axis=1)
                 )
             except np.linalg.LinAlgError:
                 return
-            motion = motion + solved[:, 0]
+            motion = motion + solved[:, 0].reshape(-1, 6)
         if not np.isfinite(motion).all():
-            self._motion = np.zeros(12)
+            self._motion = np.zeros((2, 6))
             return
         self._motion = motion
-        information = normal[12, 12] - normal[12, :12] @ solved[:, 1]
+        information = normal[size, size] - normal[size, :size] @ solved[:, 1]
         if not information > 0.0:
             return
-        readout_s = near_s + (gradient[12] - normal[12, :12] @ solved[:, 0]) / information
+        readout_s = near_s + (gradient[size] - normal[size, :size] @ solved[:, 0]) / information
         weight = information / variance
         self._sums += [1.0, weight, weight * readout_s, weight * readout_s**2]
 
@@ -209,6 +218,7 @@ class ReadoutTime(Finder):
             return
         self.is_rolling = True
         self._open = False
+        sigma_s = math.hypot(sigma_s, _RULES.usual * found_s)
         figures = {"readout_ms": 1e3 * found_s, "sigma_ms": 1e3 * sigma_s}
         first = "first" if found_s > 0.0 else "last"
         message = (
@@ -231,34 +241,33 @@ def moved_by(p: FloatArray, twists: FloatArray) -> FloatArray:
 
 
 def _equations(
-    camera: StereoCamera, three: _Three, motion: FloatArray, readout_s: float
+    camera: StereoCamera, shown: _Shown, motion: FloatArray, readout_s: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Normal equations, (13, 13) and (13,), of velocity and acceleration of the points (12,) and of
-    the readout time, with Cauchy's weights, and the variance of a pixel, px^2.
+    """Normal equations of the points' velocity and its derivatives (M, 6) and of the readout time,
+    (6 M + 1, 6 M + 1) and (6 M + 1,), with Cauchy's weights, and the variance of a pixel, px^2.
     """
-    from_s = readout_s * three.share
-    to_s = three.time_s + readout_s * three.there
-    by_velocity = to_s - from_s
-    by_acceleration = 0.5 * (to_s**2 - from_s**2)
-    there = moved_by(
-        three.points,
-        by_velocity[:, None] * motion[:6] + by_acceleration[:, None] * motion[6:],
-    )
+    from_s = readout_s * shown.share
+    to_s = shown.time_s + readout_s * shown.there
+    orders = np.arange(1, len(motion) + 1)
+    factorials = np.cumprod(orders)
+    elapsed = (to_s[:, None] ** orders - from_s[:, None] ** orders) / factorials
+    there = moved_by(shown.points, elapsed @ motion)
     there[:, 2] = np.maximum(there[:, 2], MIN_DEPTH_M)
-    r = three.z - project(camera, there)[:, :3]
+    r = shown.z - project(camera, there)[:, :3]
     by_twist = z_D_p_cam(camera, there)[:, :3] @ circledot(there)[:, :3]
-    J = np.empty((len(r), 3, 13))
-    J[:, :, :6] = by_velocity[:, None, None] * by_twist
-    J[:, :, 6:12] = by_acceleration[:, None, None] * by_twist
-    slope = to_s * three.there - from_s * three.share
-    J[:, :, 12] = slope[:, None] * (by_twist @ motion[6:])
-    squared = (r * r).sum(axis=1)
-    squared = squared[: len(r) // 2] + squared[len(r) // 2 :]  # a feature counts in both or in none
-    weight = 1.0 / (1.0 + squared / max(float(np.median(squared)), 6.0 * _RULES.least_px**2))
-    weighted = (J * np.tile(weight, 2)[:, None, None]).reshape(-1, 13)
-    variance = float((weight * squared).sum() / (6.0 * weight.sum()))
+    J = np.empty((len(r), 3, motion.size + 1))
+    J[:, :, :-1] = (elapsed[:, None, :, None] * by_twist[:, :, None]).reshape(len(r), 3, -1)
+    later = to_s[:, None] ** (orders - 1) * shown.there[:, None]
+    earlier = from_s[:, None] ** (orders - 1) * shown.share[:, None]
+    slope = ((later - earlier) * orders / factorials)[:, 1:] @ motion[1:]
+    J[:, :, -1] = (by_twist @ slope[:, :, None])[:, :, 0]
+    squared = (r * r).sum(axis=1).reshape(shown.others, -1).sum(axis=0)
+    pixels = 3.0 * shown.others  # of a feature, which counts in all frames or in none
+    weight = 1.0 / (1.0 + squared / max(float(np.median(squared)), pixels * _RULES.least_px**2))
+    weighted = (J * np.tile(weight, shown.others)[:, None, None]).reshape(len(r) * 3, -1)
+    variance = float((weight * squared).sum() / (pixels * weight.sum()))
     return (
-        weighted.T @ J.reshape(-1, 13),
+        weighted.T @ J.reshape(len(r) * 3, -1),
         weighted.T @ r.reshape(-1),
         max(variance, _RULES.least_px**2),
     )
