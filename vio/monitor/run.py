@@ -23,6 +23,7 @@ from vio.monitor.health import RefusalReport, RunHealth, is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import IntegrityMonitor, Mark
 from vio.monitor.misfit import TrackMisfit
+from vio.monitor.two_motions import TwoMotions
 from vio.monitor.view_change import ViewChange
 from vio.records import (
     Estimate,
@@ -67,6 +68,7 @@ class RunMonitor:
         self._refusals = RefusalReport(imu=imu)
         self._views = ViewChange()
         self._misfit = TrackMisfit()
+        self._motions = TwoMotions(camera)
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
         self._inertial: InertialCheck | None = None
@@ -375,8 +377,8 @@ class RunMonitor:
                 imu = imu and not self._contradiction.stands
             self._add(self._views.frame(self._seen, ratio, measured=measured, imu=imu))
             self._add(self._refusals.frame(self._seen, report, estimate))
-            if not measured:
-                self._add(self._misfit.frame(self._seen, report.misfit))
+            misfit = None if measured else report.misfit
+            self._add(self._misfit.frame(self._seen, misfit, self._motions.frame(self._seen)))
         self._scale_lines += self._health.scale(index, estimate)
         if self._inertial is not None:
             offset_s = self._inertial.clock_offset_s
