@@ -24,6 +24,7 @@ from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import IntegrityMonitor, Mark
 from vio.monitor.misfit import TrackMisfit
 from vio.monitor.two_motions import TwoMotions
+from vio.monitor.unstated_shutter import UnstatedShutter
 from vio.monitor.view_change import ViewChange
 from vio.records import (
     Estimate,
@@ -69,6 +70,7 @@ class RunMonitor:
         self._views = ViewChange()
         self._misfit = TrackMisfit()
         self._motions = TwoMotions(camera)
+        self._shutter = UnstatedShutter(camera)
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
         self._inertial: InertialCheck | None = None
@@ -379,6 +381,7 @@ class RunMonitor:
             self._add(self._refusals.frame(self._seen, report, estimate))
             misfit = None if measured else report.misfit
             self._add(self._misfit.frame(self._seen, misfit, self._motions.frame(self._seen)))
+            self._add(self._shutter.frame(self._seen))
         self._scale_lines += self._health.scale(index, estimate)
         if self._inertial is not None:
             offset_s = self._inertial.clock_offset_s

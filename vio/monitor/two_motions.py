@@ -42,7 +42,7 @@ class _MotionRules(NamedTuple):
     min_inliers: float = 0.5  # share of the moved features that follow the first motion
     min_second: int = 12  # features of the second
     # Share of all that follow it. Healthy recordings and their variants have 0 in all checks, the
-    # course's drives 0.5 in one of 368 and 0.1 in one of 266.
+    # course's drives up to 0.5 in single ones.
     min_share: float = 0.1
 
 
