@@ -217,9 +217,9 @@ def _readout(pairs: deque[_Pair]) -> tuple[float, float]:
 
 def _rolling(index: int, readout_s: float) -> Finding:
     message = (
-        f"frame {index}: rows of the images are not exposed together: they move as those of a "
-        f"rolling shutter of about {1e3 * readout_s:.0f} ms do, which is not stated "
-        "(frontend.readout_ms)"
+        f"frame {index}: pixels move as those of a rolling shutter of about {1e3 * readout_s:.0f} ms "
+        "do, and none is stated: state frontend.readout_ms; where the shutter is global, lenses or "
+        "focal lengths are not those of the calibration"
     )
     figures = {"readout_ms": 1e3 * readout_s}
     return Finding("rolling-shutter", message, index, 0, lasts=True, figures=figures)
