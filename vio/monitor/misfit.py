@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vio.findings import Finding
-from vio.monitor.two_motions import Apart
 from vio.numerics.robust import median
 from vio.records import Observations
+
+if TYPE_CHECKING:
+    from vio.guard.two_motions import Apart
 
 
 class _MisfitRules(NamedTuple):

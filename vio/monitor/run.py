@@ -23,8 +23,6 @@ from vio.monitor.health import RefusalReport, RunHealth, is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import IntegrityMonitor, Mark
 from vio.monitor.misfit import TrackMisfit
-from vio.monitor.two_motions import TwoMotions
-from vio.monitor.unstated_shutter import UnstatedShutter
 from vio.monitor.view_change import ViewChange
 from vio.records import (
     Estimate,
@@ -69,6 +67,9 @@ class RunMonitor:
         self._refusals = RefusalReport(imu=imu)
         self._views = ViewChange()
         self._misfit = TrackMisfit()
+        from vio.guard.two_motions import TwoMotions  # these load OpenCV
+        from vio.guard.unstated_shutter import UnstatedShutter
+
         self._motions = TwoMotions(camera)
         self._shutter = UnstatedShutter(camera)
         self._seen: Observations | None = None  # of the present frame

@@ -7,8 +7,8 @@ import pytest
 
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
+from vio.guard.two_motions import Apart, TwoMotions
 from vio.monitor.misfit import TrackMisfit
-from vio.monitor.two_motions import Apart, TwoMotions
 from vio.records import Observations, observations
 
 CAMERA = StereoCamera(400, 400, 320, 240, 0.1, width=640, height=480)

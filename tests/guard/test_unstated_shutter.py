@@ -8,8 +8,8 @@ import pytest
 from tests.monitor.test_misfit import updated
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
+from vio.guard.unstated_shutter import UnstatedShutter
 from vio.monitor.run import RunMonitor
-from vio.monitor.unstated_shutter import UnstatedShutter
 from vio.records import Observations, observations
 
 CAMERA = StereoCamera(400, 400, 320, 240, 0.1, width=640, height=480)
