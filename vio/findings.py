@@ -102,7 +102,7 @@ CODES: dict[str, Code] = {
     ),
     "projected-dots": Code(
         "degraded",
-        "dots of a projector are taken out of the images",
+        "dots of a projector are taken out",
         "switch the projector off",
     ),
     "rolling-shutter": Code(
@@ -131,8 +131,8 @@ CODES: dict[str, Code] = {
     ),
     "right-contradicts-left": Code(
         "degraded",
-        "points of known depth are not where the right image should show them",
-        "check the mount of the right camera, and that the cameras expose together",
+        "points of known depth are elsewhere in the right image",
+        "check the right camera's mount, and that both expose together",
     ),
     "right-matches-lost": Code(
         "degraded",
@@ -222,7 +222,7 @@ CODES: dict[str, Code] = {
         "see the message",
     ),
     "estimate-restarted": Code(
-        "degraded", "the estimate diverged, and was started again from the last good pose", ""
+        "degraded", "the estimate diverged, and began again from the last good pose", ""
     ),
     "estimate-lost": Code("unusable", "the estimate diverged, and there is no pose", ""),
     "estimate-implausible": Code(
@@ -254,7 +254,7 @@ CODES: dict[str, Code] = {
         "degraded", "the baseline is not that of a stereo camera", "check its unit"
     ),
     "one-camera-start": Code("nominal", "the trajectory of one camera begins here", ""),
-    "no-pose": Code("nominal", "frames have no pose, as the state was not observable yet", ""),
+    "no-pose": Code("nominal", "frames have no pose: the state was not observable yet", ""),
     "imu-gap": Code("degraded", "no IMU sample came for some time", "check the IMU's driver"),
     "imu-readings": Code(
         "degraded", "IMU samples are spikes, or repeat to the last bit", "check the IMU's driver"

@@ -73,6 +73,23 @@ def _held(moved_px: float, before_px: float = 0.0, lost: float = 0.0) -> bool:
     return frozen.take_held() is not None
 
 
+def _twice(flow_px: float, rest_px: float = 0.0, frames: int = 13) -> bool:
+    """Whether the last of some frames repeats the one before, where every second one moves by so
+    much, and the others hardly.
+    """
+    frozen = FrozenImages()
+    at = 0.0
+    repeated = None
+    for k in range(frames):
+        at += flow_px if k % 2 else rest_px
+        left = _noisy(_shifted(LEFT, at), 2 * k)
+        right = _noisy(_shifted(RIGHT, at), 2 * k + 1)
+        repeated = frozen.check(_frame(k, left, right), _expected(0.0))
+        if repeated is None:
+            frozen.observations(observations(k, k * STEP_NS, IDS, Z + np.array([at, 0.0, at, 0.0])))
+    return repeated is not None
+
+
 def _lines(rows: int) -> int:
     """Lines on so many repetitions, each of which ends with the next frame."""
     report = RepeatReport(IMAGES)
@@ -86,6 +103,9 @@ def _lines(rows: int) -> int:
 LIMITS: dict[str, tuple[Says, float, float]] = {
     "predicted to move": (_nearly_equal, 0.85, 1.15),
     "predictions are off": (lambda x: not _nearly_equal(off_px=x), 0.43, 0.57),
+    "twice: moved": (_twice, 0.28, 0.32),
+    "twice: unmoved": (lambda x: not _twice(1.0, x), 0.1, 0.2),
+    "twice: frames": (lambda x: _twice(1.0, frames=round(x)), 11, 13),
     "unmoved": (lambda x: not _nearly_equal(moved_px=x), 0.11, 0.2),
     "unmoved: share": (lambda x: not _partly_moved(x), 0.1, 0.35),
     "unmoved: features": (lambda n: _nearly_equal(features=int(n)), 14, 15),

@@ -71,18 +71,26 @@ def test_features_whose_patches_state_nothing_are_not_judged() -> None:
     assert _found([3.0] * 40, count=30) != []
 
 
+def updated(
+    monitor: RunMonitor, seen: Observations, misfit: float = 1.0, *, measured: bool = False
+) -> Estimate:
+    """Give a monitor a frame of a rig that moves along x, and return its estimate."""
+    k = seen.frame_index
+    monitor.observations(seen)
+    T = np.eye(4)
+    T[0, 3] = 0.05 * k
+    estimate = Estimate(seen.time_ns, T, 1e-6 * np.eye(6))
+    update = UpdateReport(100, 0, 0, 0, 0.3, 1.0, misfit=misfit)
+    monitor.update(k, update, estimate, measured=measured)
+    return monitor.judged(k, estimate)
+
+
 @pytest.mark.parametrize("measured", [True, False])
 def test_estimates_of_a_motion_that_nothing_measures_are_degraded(measured: bool) -> None:
     monitor = RunMonitor(StereoCamera(400, 400, 320, 240, 0.1), np.eye(4), imu=False)
-    estimates: list[Estimate] = []
-    for k in range(40):
-        monitor.observations(_frame(k))
-        T = np.eye(4)
-        T[0, 3] = 0.05 * k
-        estimate = Estimate(k * STEP_NS, T, 1e-6 * np.eye(6))
-        update = UpdateReport(100, 0, 0, 0, 0.3, 1.0, misfit=2.0 if k >= 20 else 1.0)
-        monitor.update(k, update, estimate, measured=measured)
-        estimates.append(monitor.judged(k, estimate))
+    estimates = [
+        updated(monitor, _frame(k), 2.0 if k >= 20 else 1.0, measured=measured) for k in range(40)
+    ]
     codes = [finding.code for finding in monitor.findings]
     assert codes == ([] if measured else ["tracks-disagree"])
     assert estimates[-1].integrity == ("nominal" if measured else "degraded")

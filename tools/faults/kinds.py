@@ -42,8 +42,10 @@ from tools.faults.views import (
     drops,
     exposure_steps,
     losing_focus,
+    mirror,
     reflection,
     robot_arm,
+    zoom,
 )
 from vio.geometry.lie import FloatArray, so3_exp
 from vio.protocols import Dataset
@@ -166,6 +168,24 @@ def _reflection(size: float, rng: np.random.Generator) -> Variant:
 
 def _unsharp(size: float, rng: np.random.Generator) -> Variant:
     return pairs(losing_focus, int(rng.integers(2)), size, int(rng.integers(5, 30)))
+
+
+def _mounted(size: float, rng: np.random.Generator) -> Variant:
+    """An arm of the rig that is always in view, and still."""
+    arm = Arm(size, 0.0, 75.0, int(rng.integers(20, 60)), seed=int(rng.integers(1000)))
+    return lambda dataset, period: pairs(robot_arm, arm)(dataset, Period(0, 2**62))
+
+
+def _mirror(size: float, rng: np.random.Generator) -> Variant:
+    begin = float(rng.uniform(0.0, 1.0 - size))
+    disparity_px = int(rng.integers(40, 80))
+    return lambda dataset, period: pairs(mirror, begin, size, disparity_px)(
+        dataset, Period(0, 2**62)
+    )
+
+
+def _zoom(size: float, rng: np.random.Generator) -> Variant:
+    return pairs(zoom, 0.01 * size, float(rng.uniform(1.0, 5.0)), *_cameras(rng))
 
 
 def _cut(size: float, rng: np.random.Generator) -> Variant:
@@ -367,6 +387,9 @@ KINDS: dict[str, Kind] = {
     "arm": Kind("cameras", "period", 0.2, 0.6, "of the height", _arm),
     "reflection": Kind("cameras", "period", 0.1, 0.6, "of its contrast", _reflection),
     "focus": Kind("cameras", "period", 1.0, 6.0, "px of blur", _unsharp),
+    "part of the rig": Kind("cameras", "always", 0.2, 0.6, "of the height", _mounted),
+    "mirror": Kind("cameras", "always", 0.2, 0.6, "of the width", _mirror),
+    "zoom": Kind("cameras", "onwards", 0.5, 3.0, "%", _zoom),
 }
 # Every second kind is kept aside: the two of a similar pair come to different halves.
 HALVES: dict[str, Half] = {

@@ -10,7 +10,7 @@ import numpy as np
 from tools.faults.changes import Pair, PairChange, Period, blurred, to_gray
 from vio.geometry.lie import FloatArray
 from vio.protocols import Dataset
-from vio.records import Image, StereoFrame
+from vio.records import S_PER_NS, Image, StereoFrame
 
 _NOISE = 2.0  # gray levels, standard deviation, of what is drawn into images
 _DIRT_GRAY = 40.0
@@ -191,3 +191,52 @@ def losing_focus(
         return out[0], out[1]
 
     return unsharp
+
+
+def mirror(
+    dataset: Dataset, period: Period, begin: float, share: float, disparity_px: int
+) -> PairChange:
+    """A mirror covers some columns of both images, from a share of the width on: it shows the view
+    from right to left.
+    """
+
+    def mirrored(frame: StereoFrame, *pair: Image) -> Pair:
+        if not period.holds(frame.time_ns):
+            return pair[0], pair[1]
+        out = []
+        for k, image in enumerate(pair):
+            width = image.shape[1]
+            near_px = k * disparity_px // 3  # the frame of the mirror is nearer than what it shows
+            columns = np.arange(round(begin * width), round((begin + share) * width)) - near_px
+            columns = columns[(columns >= 0) & (columns < width)]
+            seen = np.clip(width - 1 - columns - k * disparity_px, 0, width - 1)
+            changed = image.copy()
+            changed[:, columns] = image[:, seen]
+            out.append(changed)
+        return out[0], out[1]
+
+    return mirrored
+
+
+def zoom(
+    dataset: Dataset, period: Period, growth: float, seconds: float, *cameras: int
+) -> PairChange:
+    """The focal length of some cameras grows by a share over some seconds, and stays so."""
+    camera = dataset.recording.camera
+
+    def zoomed(frame: StereoFrame, *pair: Image) -> Pair:
+        out = list(pair)
+        passed = np.clip((frame.time_ns - period.begin_ns) * S_PER_NS / seconds, 0.0, 1.0)
+        scale = 1.0 + growth * float(passed)
+        moved = np.array(
+            [[scale, 0.0, camera.cu * (1.0 - scale)], [0.0, scale, camera.cv * (1.0 - scale)]]
+        )
+        for k in cameras:
+            if passed > 0.0:
+                size = out[k].shape[::-1]
+                border = cv2.BORDER_REPLICATE
+                warped = cv2.warpAffine(out[k], moved, size, borderMode=border)
+                out[k] = np.asarray(warped, dtype=np.uint8)
+        return out[0], out[1]
+
+    return zoomed

@@ -7,8 +7,8 @@ stopped at once. By images alone, a rig that crept and did not slow down may hav
 frames are left out, and nothing is said of them. Nearly equal
 pairs (encoded again, or with noise on top) are the same where the tracked corners have not moved,
 while the motion predicted since the last frame moves them by more than its uncertainty allows and
-the IMU is not at standstill. A rig at standstill gives nearly equal images, too; there the
-prediction agrees, and they are used.
+the IMU is not at standstill, or while every second frame has shown no motion. A rig at standstill
+gives nearly equal images, too; there the prediction agrees, and they are used.
 """
 
 from __future__ import annotations
@@ -60,6 +60,9 @@ class _FlowRules(NamedTuple):
     unmoved_px: float = 0.15  # the flow of an unmoved corner under noise of a few gray levels
     unmoved_share: float = 0.8  # of the corners that must be unmoved
     first_rows: Capacity[int] = 8  # compared before all others
+    # the newest, of which every second one has moved and the others have not: no rig does that, and
+    # each pair comes twice
+    twice_frames: int = 12
 
 
 _FLOW = _FlowRules()
@@ -120,6 +123,8 @@ class FrozenImages:
         self._deep: StereoFrame | None = None
         self._same_depth = False  # that of the frame before was one
         self._expected: Prediction | None = None  # of the present frame
+        # flow (median) of each frame, in pixels; none where it repeats the one before
+        self._flows = deque[float](maxlen=_FLOW.twice_frames)
         # median error of each frame's predicted pixels
         self._errors_px: deque[float] = deque(maxlen=_FLOW.recent_frames)
 
@@ -142,6 +147,7 @@ class FrozenImages:
         self._seen_first = self._seen_before
         before = self._seen_before = self._seen
         self._seen = seen
+        self._flows.append(self._flow_px())
         if self._ended_still is not None and before is not None and len(before):
             since, before_px = self._ended_still
             begun = self._flow_px() > max(_BEGUN.min_px, _BEGUN.factor * before_px)
@@ -159,6 +165,8 @@ class FrozenImages:
         self._expected = expected
         if self._repeating is None:
             self._shown = frame
+        else:
+            self._flows.append(0.0)
         return self._repeating
 
     def _flow_px(self) -> float:
@@ -226,11 +234,19 @@ class FrozenImages:
         self._crept = 0
         if self._seen is None or expected is None:
             return None
-        if self._repeating is not None and self._repeating.certain:
+        is_expected = self._repeating is not None and self._repeating.certain
+        if is_expected or self._comes_twice():
             frozen = _unmoved(shown, frame, self._seen)
         else:
             frozen = self._has_stopped(frame, shown, self._seen, expected)
         return Repeated(shown.index, False) if frozen else None
+
+    def _comes_twice(self) -> bool:
+        """Whether every second frame so far has shown no motion, and the last one has."""
+        flows = list(self._flows)
+        if len(flows) < _FLOW.twice_frames:
+            return False
+        return max(flows[0::2]) < _FLOW.unmoved_px and min(flows[1::2]) > _FLOW.moved_px
 
     def _has_stopped(
         self, frame: StereoFrame, shown: StereoFrame, seen: Observations, expected: Prediction

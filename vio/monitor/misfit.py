@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vio.findings import Finding
 from vio.numerics.robust import median
 from vio.records import Observations
+
+if TYPE_CHECKING:
+    from vio.guard.two_motions import Apart
 
 
 class _MisfitRules(NamedTuple):
@@ -51,32 +54,48 @@ class TrackMisfit:
         self._disagree = False  # as reported
         self._clear = 0  # frames in a row in which they do not
 
-    def frame(self, seen: Observations, misfit: float) -> list[Finding]:
+    def frame(
+        self, seen: Observations, misfit: float | None, apart: Apart | None = None
+    ) -> list[Finding]:
         """Return what begins or ends with a frame.
 
         Args:
-            seen: its features, with the standard deviations of their patches; without, nothing is
-                judged.
-            misfit: as in `UpdateReport`.
+            seen: its features, with the standard deviations of their patches; without, misfits are
+                not judged.
+            misfit: as in `UpdateReport`; None: it is not judged, as a sensor measures the motion.
+            apart: features that follow a second motion; None: there are none.
         """
-        if seen.sigma is None:
+        excess = None if misfit is None else self._excess(seen, misfit)
+        if excess is None and apart is None and not self._disagree:
             return []
-        stated_px = seen.sigma[seen.sigma[:, 0] > 0.0, 0]
-        if len(stated_px) < _MISFIT.min_features:
-            return []
-        self._indices.append(seen.frame_index)
-        self._excesses.append(misfit / self._explained(float(np.median(stated_px))))
-        excess = median(np.array(self._excesses))
-        is_beyond = len(self._excesses) == _MISFIT.frames and excess > _MISFIT.limit
+        is_beyond = apart is not None or (excess is not None and excess > _MISFIT.limit)
         self._clear = 0 if is_beyond else self._clear + 1
         if is_beyond and not self._disagree:
             self._disagree = True
+            if apart is not None:
+                return [_apart(seen.frame_index, apart)]
+            assert excess is not None
             return [_begun(seen.frame_index, self._indices[0], excess)]
         if self._disagree and self._clear >= _MISFIT.clear_frames:
             self._disagree = False
             message = f"frame {seen.frame_index}: tracks fit a common motion again"
             return [Finding(_CODE, message, seen.frame_index, ended=True)]
         return []
+
+    def _excess(self, seen: Observations, misfit: float) -> float | None:
+        """By how much tracks fit worse than their patches explain, of late; None: too few frames or
+        features tell.
+        """
+        if seen.sigma is None:
+            return None
+        stated_px = seen.sigma[seen.sigma[:, 0] > 0.0, 0]
+        if len(stated_px) < _MISFIT.min_features:
+            return None
+        self._indices.append(seen.frame_index)
+        self._excesses.append(misfit / self._explained(float(np.median(stated_px))))
+        if len(self._excesses) < _MISFIT.frames:
+            return None
+        return median(np.array(self._excesses))
 
     def _explained(self, stated_px: float) -> float:
         """By how much a frame's patches fit worse than usual, as a ratio of variances, at least 1,
@@ -98,3 +117,14 @@ def _begun(index: int, since: int, excess: float) -> Finding:
         "slowly or in much of the image, and the motion may be a compromise with it"
     )
     return Finding(_CODE, message, index, since, lasts=True, figures={"excess": excess})
+
+
+def _apart(index: int, apart: Apart) -> Finding:
+    how = "stay at the same pixels" if apart.still else "follow another motion"
+    message = (
+        f"frame {index}: {100 * apart.share:.0f} % of the tracks {how} while the others move: a part "
+        "of the rig, a mirror or a reflection is in view, or an object moves slowly, and the motion "
+        "may be a compromise with it"
+    )
+    figures = {"second_share": apart.share}
+    return Finding(_CODE, message, index, apart.since, lasts=True, figures=figures)

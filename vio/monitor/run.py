@@ -67,6 +67,9 @@ class RunMonitor:
         self._refusals = RefusalReport(imu=imu)
         self._views = ViewChange()
         self._misfit = TrackMisfit()
+        from vio.guard.two_motions import TwoMotions  # loads OpenCV
+
+        self._motions = TwoMotions(camera)
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
         self._inertial: InertialCheck | None = None
@@ -375,8 +378,8 @@ class RunMonitor:
                 imu = imu and not self._contradiction.stands
             self._add(self._views.frame(self._seen, ratio, measured=measured, imu=imu))
             self._add(self._refusals.frame(self._seen, report, estimate))
-            if not measured:
-                self._add(self._misfit.frame(self._seen, report.misfit))
+            misfit = None if measured else report.misfit
+            self._add(self._misfit.frame(self._seen, misfit, self._motions.frame(self._seen)))
         self._scale_lines += self._health.scale(index, estimate)
         if self._inertial is not None:
             offset_s = self._inertial.clock_offset_s
