@@ -71,7 +71,7 @@ def test_what_the_rig_carries_is_found_where_it_moves_slowly(still: bool) -> Non
 def test_it_holds_since_its_features_were_used() -> None:
     found = _last(_frames(0.3, STILL, since=17))
     assert found is not None
-    assert found.since == 17
+    assert 15 <= found.since <= 17  # every third frame is compared
 
 
 def test_a_share_of_a_tenth_is_named() -> None:

@@ -67,7 +67,7 @@ class TwoMotions:
         self._has_depth = camera.kind != "mono"
         self._frames = deque[Observations](maxlen=_MOTIONS.spans[-1] + 1)
         # features of the last frame that was compared, and the frames that they were seen in first,
-        # or the one compared before that
+        # or the one after that compared before
         self._ids: IntArray = np.zeros(0, dtype=np.int64)
         self._first: IntArray = np.zeros(0, dtype=np.int64)
         self._index: int | None = None  # of that frame
@@ -93,8 +93,8 @@ class TwoMotions:
 
     def _see(self, seen: Observations) -> None:
         """Keep the frames that features were seen in first."""
-        before = self._frames[0].frame_index if self._index is None else self._index
-        first = np.full(len(seen), before)
+        earliest = self._frames[0].frame_index if self._index is None else self._index + 1
+        first = np.full(len(seen), earliest)
         rows, others = shared_rows(seen.ids, self._ids)
         first[rows] = self._first[others]
         self._ids = seen.ids
