@@ -13,6 +13,7 @@ import pytest
 
 from vio.errors import DataError, EvaluationError
 from vio.evaluation import reference_faults
+from vio.evaluation.alignment import Alignment
 from vio.evaluation.trajectories import evaluate
 from vio.files.epochs import epoch_hint
 from vio.files.trajectories import read_trajectory
@@ -197,6 +198,16 @@ def test_an_estimate_that_drifts_is_no_other_point_of_the_body(
 ) -> None:
     notes = evaluate(_odometry(scale, turn_rad, noise), _trajectory()).notes
     assert not [note for note in notes if "another point of the body" in note]
+
+
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_a_scale_that_diverges_is_no_other_point_of_the_body() -> None:
+    T_ref = _trajectory().T_world_body[::10]
+    start = Alignment(R=np.eye(3), t=np.zeros(3), scale=1e-9)
+    error_m, _ = reference_faults._beside_arm(
+        T_ref, T_ref[:, :3, 3] + 1.0, start, scaled=True, arm=True
+    )
+    assert error_m == np.inf
 
 
 def test_an_estimate_without_a_scale_is_called_so() -> None:

@@ -5,6 +5,7 @@ point of the body.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sized
 from typing import NamedTuple
 
@@ -150,7 +151,7 @@ def _explaining_arm(T_est: FloatArray, T_ref: FloatArray) -> tuple[float, float,
         start = align_poses(T_est, T_ref[::every], "sim3" if scaled else "se3")
         without_m, _ = _beside_arm(T_est, y, start, scaled=scaled, arm=False)
         left_m, arm = _beside_arm(T_est, y, start, scaled=scaled, arm=True)
-        if not left_m < _FAULT.explained * without_m:
+        if not (math.isfinite(without_m) and left_m < _FAULT.explained * without_m):
             return None
         arms.append((without_m, left_m, arm))
     return arms[0]
@@ -188,6 +189,8 @@ def _beside_arm(
         if arm:
             columns.append(s * R @ T_est[:, :3, :3])
         J = np.concatenate(columns, axis=2).reshape(3 * len(y), -1)
+        if not np.isfinite(J).all():  # of a diverged estimate
+            return math.inf, lever
         step = np.linalg.lstsq(J, error.ravel(), rcond=None)[0]
         R = so3_exp(step[:3]) @ R
         t = t + step[3:6]
