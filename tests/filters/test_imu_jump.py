@@ -260,10 +260,23 @@ def test_a_bias_that_comes_back_has_not_jumped() -> None:
     assert not jump.repeats(np.array([-0.1, 0, 0]))
     jump.doubt(np.zeros(3), np.full(3, 0.002))
     jump.doubt(np.array([0.1, 0, 0]), np.full(3, 0.05))  # the first one counts
-    assert jump.agrees(np.array([0.004, 0, 0])) is None
+    known = np.full(3, 0.002)
+    assert jump.agrees(np.array([0.004, 0, 0]), known) is None
+    jump.doubt(np.zeros(3), known)
+    assert jump.agrees(np.array([0.1, 0, 0]), known) == pytest.approx(0.1)
+    assert jump.agrees(np.array([0.1, 0, 0]), known) is None
+
+
+def test_a_bias_that_is_not_known_yet_has_neither_jumped_nor_come_back() -> None:
+    jump = GyroJump()
+    off = np.array([0.05, 0.0, 0.0])
     jump.doubt(np.zeros(3), np.full(3, 0.002))
-    assert jump.agrees(np.array([0.1, 0, 0])) == pytest.approx(0.1)
-    assert jump.agrees(np.array([0.1, 0, 0])) is None
+    assert jump.agrees(off, np.full(3, 0.03)) is None
+    assert jump.agrees(off, np.full(3, 0.005)) == pytest.approx(0.05)
+    jump.doubt(np.zeros(3), np.full(3, 0.002))
+    assert jump.agrees(off, np.full(3, 0.03)) is None
+    assert jump.agrees(0.1 * off, np.full(3, 0.003)) is None  # it has come back
+    assert jump.agrees(off, np.full(3, 0.003)) is None
 
 
 @pytest.mark.parametrize(("rate", "alike"), [(0.149, False), (0.151, True)])
@@ -320,4 +333,5 @@ def test_corrections_in_all_directions_are_no_rate(share: float, shown: bool) ->
 def test_a_change_within_three_standard_deviations_is_no_jump(sigmas: float, named: bool) -> None:
     jump = GyroJump()
     jump.doubt(np.zeros(3), np.array([0.0, 0.002, 0.0]))
-    assert (jump.agrees(np.array([0.002 * sigmas, 0.0, 0.0])) is not None) == named
+    change = np.array([0.002 * sigmas, 0.0, 0.0])
+    assert (jump.agrees(change, np.zeros(3)) is not None) == named

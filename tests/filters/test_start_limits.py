@@ -196,7 +196,7 @@ def _changed(sigmas: float) -> bool:
     jump = GyroJump()
     sigma = np.array([0.01, 0.0, 0.0])
     jump.doubt(np.zeros(3), sigma)
-    return jump.agrees(sigmas * sigma) is not None
+    return jump.agrees(sigmas * sigma, 0.0 * sigma) is not None
 
 
 def _repeats(less: float) -> bool:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.cameras.rectification_error import CONSIDERED
-from vio.filters.imu_jump import GyroJump, ShownMotion
+from vio.filters.imu_jump import GyroJump, ShownMotion, bias_sigma
 from vio.filters.landmark_gate import LandmarkGate
 from vio.filters.new_landmarks import NewLandmarks
 from vio.filters.noise import StepErrors
@@ -123,7 +123,7 @@ class FrameUpdate:
             missing = step.missing_noise()
             self._gyro_jump.take(off=is_shocked or bool(missing[1]))
             if not is_shocked:
-                jump_radps = self._gyro_jump.agrees(window.nav.gyro_bias)
+                jump_radps = self._gyro_jump.agrees(window.nav.gyro_bias, bias_sigma(window))
             trusted = not is_shocked
             if trusted and missing.any():
                 first = _Fitted(tracks, fitted, pixels, trusted)

@@ -10,6 +10,7 @@ The images estimate both anew: equation (N15) of docs/math.md.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
@@ -70,7 +71,8 @@ class _JumpRules(NamedTuple):
     max_off_steps: int = 3
     # innovations over their standard deviation (median): more, and the gyro may have jumped
     innovation_sigmas: float = 1.4
-    changed_sigmas: float = 3.0  # of the bias before: less is no jump
+    changed_sigmas: float = 3.0  # of the bias before and now: less is no jump
+    known_again: float = 2.0  # standard deviations of before; the bias is as well known again
     # of the larger one: rates of two steps that differ by less are one jump
     alike_share: float = 0.5
     # cosine of the angle between two rates of which the second is larger, above which it is one:
@@ -307,7 +309,7 @@ class GyroJump:
 
     def _doubt_gyro(self, window: Window, turn: FloatArray, growth: Growth, seconds: float) -> None:
         """Make the bias uncertain by a rotation (3,) over some seconds up to the newest step."""
-        self.doubt(window.nav.gyro_bias, np.sqrt(np.diag(window.prior.P)[9:12]))
+        self.doubt(window.nav.gyro_bias, bias_sigma(window))
         lacking = _noise_of(growth, turn, 1) + _bias_doubt(growth, turn, seconds)
         window.inflate_process_noise(lacking)
 
@@ -341,21 +343,31 @@ class GyroJump:
         if self._before is None:
             self._before = bias, sigma
 
-    def agrees(self, bias: FloatArray) -> float | None:
-        """Take the bias (3,) after a step that the gyro has predicted.
+    def agrees(self, bias: FloatArray, sigma: FloatArray) -> float | None:
+        """Take the bias (3,) and its standard deviations after a step that the gyro has predicted.
 
-        Return by how much it has changed since it was doubted, rad/s; None: it was not, or it has
-        come back.
+        Return by how much it has changed since it was doubted, rad/s, as soon as that is known;
+        None: it was not doubted, it is not known yet, or the bias has come back.
         """
         self._rate = None
         if self._before is None:
             return None
-        before, sigma = self._before
-        self._before = None
+        before, sigma_before = self._before
+        usual = length(sigma_before)
+        now = length(sigma)
         changed = length(bias - before)
-        if changed > _JUMP.changed_sigmas * length(sigma):
+        if changed > _JUMP.changed_sigmas * math.hypot(usual, now):
+            self._before = None
             return changed
+        if now < _JUMP.known_again * usual:
+            self._before = None
         return None
+
+
+def bias_sigma(window: Window) -> FloatArray:
+    """Standard deviations (3,) of the gyro's bias."""
+    sigma: FloatArray = np.sqrt(window.prior.P.diagonal()[9:12])
+    return sigma
 
 
 def _common_turn(steps: list[StepErrors]) -> FloatArray | None:
