@@ -267,8 +267,9 @@ def _rest(seconds: float, gap_periods: float = 1.0, shift: float = 0.0) -> bool:
     count = round(10 * seconds) + 1
     times = 0.1 * np.arange(count)
     times[count // 2 :] += 0.1 * (gap_periods - 1.0)
-    values = rng.normal(size=(count, 6))
-    values[count // 2 :, 0] += shift / np.sqrt(10.0)
+    values = 1e-3 * rng.normal(size=(count, 6))
+    values[count // 2 :, 0] += 1e-3 * shift / np.sqrt(10.0)
+    values[:, 5] += 9.81
     try:
         measure_noise(ImuRecord((1e9 * times).astype(np.int64), values[:, :3], values[:, 3:]))
     except DataError:

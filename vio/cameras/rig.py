@@ -124,7 +124,8 @@ class Rectifier:
         """
         if self.maps is None:
             return None
-        return np.ascontiguousarray(self.maps[camera][0][..., 1])
+        rows: IntArray = self.maps[camera][0][..., 1]
+        return rows
 
     def frame(
         self,
