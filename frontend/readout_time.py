@@ -45,7 +45,9 @@ class _ReadoutRules(NamedTuple):
     # of the readout time, by what it is off on six rendered rigs with usual errors
     usual: float = 0.1
     least_s: float = 2e-3  # shorter readout times count as none
-    sigma_s: float = 0.5e-3  # as precise as that, it is known, and a shorter one is none for good
+    sigma_s: float = (
+        0.5e-3  # as precise as that, it is known, and a shorter one is none from then on
+    )
     # after so many looks at every other frame, and at every fifth, every tenth is enough
     often: tuple[int, int] = (20, 40)
 
@@ -58,7 +60,7 @@ class RowShares:
     """When pixels are exposed: their raw row's share of the image, after the middle one."""
 
     def __init__(self, camera: StereoCamera, rectifier: Rectifier | None) -> None:
-        """Prepare for a rectified camera; `rectifier` of its raw images, if they are rectified here."""
+        """Prepare for a rectified camera; `rectifier`: of its raw images, None: there are none."""
         self._rows: tuple[IntArray | None, ...] = (None, None)
         heights = (camera.height, camera.height)
         if rectifier is not None:
@@ -114,8 +116,12 @@ class ReadoutTime(Finder):
         self._near_s = 0.0  # that equations are linearised at
         self._passes = 0
         self._open = camera.kind != "mono" and shares.known
-        self.readout_s = 0.0  # as far as known; it is of use once `is_rolling`
-        self.is_rolling = False
+        self.readout_s = 0.0  # 0 until a rolling shutter is certain
+
+    @property
+    def is_rolling(self) -> bool:
+        """Whether the shutter is a rolling one, for certain."""
+        return self.readout_s != 0.0
 
     def frame(self, seen: Observations) -> None:
         """Take the features of the next frame as the camera shows them."""
@@ -201,7 +207,7 @@ class ReadoutTime(Finder):
         count, weight, product, squares = self._sums.tolist()
         if count < _RULES.triples:
             return
-        self.readout_s = found_s = product / weight
+        found_s = product / weight
         scatter = max((squares - product * found_s) / (count - 1.0), 1.0)
         sigma_s = math.sqrt(scatter / weight)
         step_s = (seen.time_ns - self._frames[-2].time_ns) / NS_PER_S
@@ -216,7 +222,7 @@ class ReadoutTime(Finder):
             return
         if sigma_s > max(_RULES.sigma_s, _RULES.precise * abs(found_s)):
             return
-        self.is_rolling = True
+        self.readout_s = found_s
         self._open = False
         sigma_s = math.hypot(sigma_s, _RULES.usual * found_s)
         figures = {"readout_ms": 1e3 * found_s, "sigma_ms": 1e3 * sigma_s}

@@ -95,9 +95,9 @@ class RollingShutter:
         """
         if self._search is not None and not self._readout_s:
             self._search.frame(seen)
-            if not self._search.is_rolling:
-                return seen
             self._readout_s = self._search.readout_s
+            if not self._readout_s:
+                return seen
         p, has_depth = triangulate(self._camera, seen.z, min_disparity_px=DEPTH_DISPARITY_PX)
         has_depth &= seen.has_right & ~seen.stale
         late_s = self._readout_s * self._shares.of(seen.z)

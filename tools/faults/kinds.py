@@ -173,15 +173,18 @@ def _unsharp(size: float, rng: np.random.Generator) -> Variant:
 def _mounted(size: float, rng: np.random.Generator) -> Variant:
     """An arm of the rig that is always in view, and still."""
     arm = Arm(size, 0.0, 75.0, int(rng.integers(20, 60)), seed=int(rng.integers(1000)))
-    return lambda dataset, period: pairs(robot_arm, arm)(dataset, Period(0, 2**62))
+    return _always(pairs(robot_arm, arm))
 
 
 def _mirror(size: float, rng: np.random.Generator) -> Variant:
     begin = float(rng.uniform(0.0, 1.0 - size))
     disparity_px = int(rng.integers(40, 80))
-    return lambda dataset, period: pairs(mirror, begin, size, disparity_px)(
-        dataset, Period(0, 2**62)
-    )
+    return _always(pairs(mirror, begin, size, disparity_px))
+
+
+def _always(variant: Variant) -> Variant:
+    """A variant whose period is the whole recording."""
+    return lambda dataset, period: variant(dataset, Period(0, 2**62))
 
 
 def _zoom(size: float, rng: np.random.Generator) -> Variant:

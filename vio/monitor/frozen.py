@@ -150,7 +150,7 @@ class FrozenImages:
         self._flows.append(self._flow_px())
         if self._ended_still is not None and before is not None and len(before):
             since, before_px = self._ended_still
-            begun = self._flow_px() > max(_BEGUN.min_px, _BEGUN.factor * before_px)
+            begun = self._flows[-1] > max(_BEGUN.min_px, _BEGUN.factor * before_px)
             if begun or np.isin(before.ids, seen.ids).mean() < _BEGUN.lost_share:
                 self._held_since = since
         self._ended_still = None

@@ -18,6 +18,12 @@ from vio.records import Image, ImuSample
 LOST_S = 5.0
 
 Layout: TypeAlias = Literal["side-by-side", "top-bottom", "single"]
+# images beside and below one another in a picture
+IN_A_PICTURE: dict[Layout, tuple[int, int]] = {
+    "side-by-side": (2, 1),
+    "top-bottom": (1, 2),
+    "single": (1, 1),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,12 @@ def is_recorded(name: str) -> bool:
     return scheme in ("video", "realsense") and Path(rest).is_file()
 
 
+def _whole(layout: Layout, size: tuple[int, int]) -> tuple[int, int]:
+    """Return width and height of a picture of images of a size."""
+    across, down = IN_A_PICTURE[layout]
+    return across * size[0], down * size[1]
+
+
 def layout_hint(layout: Layout, half: tuple[int, int], size: tuple[int, int]) -> str:
     """Return why the images of a video have another width and height than a calibration.
 
@@ -78,17 +90,11 @@ def layout_hint(layout: Layout, half: tuple[int, int], size: tuple[int, int]) ->
         half: of an image.
         size: of the calibration.
     """
-    across, down = {"side-by-side": (2, 1), "top-bottom": (1, 2), "single": (1, 1)}[layout]
-    whole = (across * half[0], down * half[1])
+    whole = _whole(layout, half)
     text = f"the picture is {whole[0]}x{whole[1]} pixels"
     if layout != "single":
         text += f", and each image {layout} in it {half[0]}x{half[1]}"
-    wanted = {
-        "side-by-side": (2 * size[0], size[1]),
-        "top-bottom": (size[0], 2 * size[1]),
-        "single": size,
-    }
-    other = next((name for name, needs in wanted.items() if needs == whole), None)
+    other = next((name for name in IN_A_PICTURE if _whole(name, size) == whole), None)
     if other == "single":
         why = "it is that of one camera: give --layout single, with an IMU, or the camera that sends both"
     elif other is not None:

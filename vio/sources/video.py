@@ -13,7 +13,7 @@ from vio.cameras.rig import Rig
 from vio.errors import DataError
 from vio.numerics.kinds import Capacity
 from vio.records import Image
-from vio.sources.source import Layout, SourceEvent, SourceFrame
+from vio.sources.source import IN_A_PICTURE, Layout, SourceEvent, SourceFrame
 
 _MAX_FAILED = 50  # reads in a row without an image, after which a device has gone
 _PAUSE_S: Capacity[float] = 0.02  # between them
@@ -69,10 +69,9 @@ class VideoSource:
         """Return width and height of one image as the video states them; None: it does not."""
         width = round(self._video.get(cv2.CAP_PROP_FRAME_WIDTH))
         height = round(self._video.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        if self._layout == "side-by-side":
-            width //= 2
-        if self._layout == "top-bottom":
-            height //= 2
+        across, down = IN_A_PICTURE[self._layout]
+        width //= across
+        height //= down
         return (width, height) if width > 0 and height > 0 else None
 
     def events(self) -> Iterator[SourceEvent | None]:
