@@ -181,9 +181,9 @@ def check_own(path: Path) -> None:
         )
 
 
-def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file atomically: it holds either its old content or all of the new. Its folder must
-    exist.
+def atomic_write_bytes(path: str | os.PathLike[str], *parts: bytes | memoryview) -> None:
+    """Write a file of parts, one behind the other, atomically: it holds either its old content or
+    all of the new. Its folder must exist.
 
     Raises:
         DataError: the folder is missing or not writable, or the disk is full.
@@ -197,7 +197,8 @@ def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
                 if fcntl is not None:
                     with contextlib.suppress(OSError):
                         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                stream.write(data)
+                for part in parts:
+                    stream.write(part)
                 stream.flush()
                 os.fsync(stream.fileno())
             partial.replace(target)

@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.guard.image_check import FrameImages, ImageCheck
+from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Capacity
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, Image
@@ -59,7 +59,7 @@ class ProjectedDots(ImageCheck):
 
     def __init__(self) -> None:
         super().__init__()
-        self._last: tuple[int, FloatArray] | None = None  # time and blocks of an image
+        self._last: tuple[int, Image] | None = None  # time and parts of an image
         # comparisons: the frame, and whether it shows dots
         self._signs = deque[tuple[int, bool]](maxlen=_DOTS.newest)
         self._active = False  # there are dots
@@ -88,12 +88,11 @@ class ProjectedDots(ImageCheck):
         if elapsed_s < _DOTS.min_s:
             return
         last = self._last
-        blocks = _blocks(images.halves[0])
-        self._last = time_ns, blocks
-        if last is None or elapsed_s > _DOTS.max_s or last[1].shape != blocks.shape:
+        parts = _parts(images.halves[0])
+        self._last = time_ns, parts
+        if last is None or elapsed_s > _DOTS.max_s or last[1].shape != parts.shape:
             return
-        correlations = np.einsum("pbi,pbi->pb", last[1], blocks)
-        bright, dark, coarse = (median(part) for part in correlations)
+        bright, dark, coarse = (median(part) for part in _correlations(last[1], parts))
         is_sign = bright >= _DOTS.min_correlation and bright - max(dark, coarse) >= _DOTS.min_excess
         if not is_sign and coarse < _DOTS.moved_correlation:
             self._since = images.index
@@ -121,20 +120,45 @@ def without_dots(image: Image) -> Image:
     return np.asarray(cv2.morphologyEx(image, cv2.MORPH_OPEN, element), dtype=np.uint8)
 
 
-def _blocks(half: Image) -> FloatArray:
-    """Small bright spots, small dark ones and the coarse image (3, B, pixels) in blocks of an image
-    at half resolution, each block less its mean and of norm 1.
+def _parts(half: Image) -> Image:
+    """Small bright spots, small dark ones and the coarse image (3, H, W) of an image at half
+    resolution, of which rows and columns beyond whole blocks are left out.
     """
-    height = half.shape[0] // _DOTS.rows
-    width = half.shape[1] // _DOTS.columns
-    part: npt.NDArray[np.float64] = np.empty((3, _DOTS.rows * height, _DOTS.columns * width))
-    seen = half[: part.shape[1], : part.shape[2]]
-    part[0] = cv2.morphologyEx(seen, cv2.MORPH_TOPHAT, _SMALL)
-    part[1] = cv2.morphologyEx(seen, cv2.MORPH_BLACKHAT, _SMALL)
-    part[2] = cv2.GaussianBlur(seen, (0, 0), _DOTS.coarse_sigma_px)
-    grid = part.reshape(3, _DOTS.rows, height, _DOTS.columns, width).swapaxes(2, 3)
-    blocks = grid.reshape(3, _DOTS.rows * _DOTS.columns, height * width)
-    blocks -= blocks.mean(axis=2, keepdims=True)
-    norms = np.sqrt(np.einsum("pbi,pbi->pb", blocks, blocks))
-    out: FloatArray = blocks / np.maximum(norms, 1e-6)[:, :, None]
+    height, width = half.shape
+    seen = half[: height - height % _DOTS.rows, : width - width % _DOTS.columns]
+    out: Image = np.empty((3, *seen.shape), dtype=np.uint8)
+    out[0] = cv2.morphologyEx(seen, cv2.MORPH_TOPHAT, _SMALL)
+    out[1] = cv2.morphologyEx(seen, cv2.MORPH_BLACKHAT, _SMALL)
+    out[2] = cv2.GaussianBlur(seen, (0, 0), _DOTS.coarse_sigma_px)
     return out
+
+
+def _correlations(before: Image, now: Image) -> FloatArray:
+    """Correlations (3, B) of two images' parts (3, H, W) in each block; 0 where one is uniform."""
+    out: FloatArray = np.empty((len(now), _DOTS.rows * _DOTS.columns))
+    _correlate(before, now, _DOTS.rows, _DOTS.columns, out)
+    return out
+
+
+@compiled
+def _correlate(before: Image, now: Image, rows: int, columns: int, out: FloatArray) -> None:
+    parts, height, width = now.shape
+    high = height // rows
+    wide = width // columns
+    count = high * wide
+    for part in range(parts):
+        for block in range(rows * columns):
+            v = block // columns * high
+            u = block % columns * wide
+            a = b = aa = bb = ab = 0
+            for i in range(v, v + high):
+                for j in range(u, u + wide):
+                    x = np.int64(before[part, i, j])
+                    y = np.int64(now[part, i, j])
+                    a += x
+                    b += y
+                    aa += x * x
+                    bb += y * y
+                    ab += x * y
+            spread = float(count * aa - a * a) * float(count * bb - b * b)
+            out[part, block] = (count * ab - a * b) / np.sqrt(spread) if spread > 0.0 else 0.0

@@ -16,7 +16,7 @@ import types
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache
+from functools import cache, reduce
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, Protocol
 
@@ -81,8 +81,10 @@ def save_checkpoint(
     head = json.dumps(
         {"program": _program(), "inputs": dict(inputs or {}), "tree_bytes": len(tree)}
     ).encode()
-    body = b"".join((head, b"\n", tree, *writer.blobs))
-    atomic_write_bytes(path, b"".join((b"%08x" % zlib.crc32(body), body)))
+    # The arrays are written from where they are: copies would double what a run needs.
+    parts = (head, b"\n", tree, *writer.blobs)
+    checksum = reduce(lambda crc, part: zlib.crc32(part, crc), parts, 0)
+    atomic_write_bytes(path, b"%08x" % checksum, *parts)
 
 
 def checkpoint_id(path: Path) -> int:
@@ -180,7 +182,7 @@ class _Writer:
     """Makes a tree of a state, and collects the bytes of its arrays."""
 
     def __init__(self, dataset: Dataset) -> None:
-        self.blobs: list[bytes] = []
+        self.blobs: list[memoryview] = []  # of the arrays, most of which share their memory
         self._dataset = dataset
         self._bytes = 0
         # of the objects, by id; -1: a tuple or set that has not ended
@@ -260,7 +262,7 @@ class _Writer:
         if value.dtype.hasobject:
             raise NotSavableError("an array of objects does not belong into a checkpoint")
         order: Literal["C", "F"] = "F" if value.flags.fnc else "C"
-        self.blobs.append(value.tobytes(order))
+        self.blobs.append(value.ravel(order).view(np.uint8).data)
         start = self._bytes
         self._bytes = self._bytes + value.nbytes
         if value.dtype.names:
