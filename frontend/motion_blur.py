@@ -36,7 +36,9 @@ class _BlurRules(NamedTuple):
 _RULES = _BlurRules()
 _MIN_MOVED_PX: Tolerance[float] = 1.5  # since the last frame; others show nothing
 _LEAST_PX2: Tolerance[float] = 0.02  # blur below which an anchor stays as it is
-_CHANGE: Tolerance[float] = 0.1  # of a blur, by which it changes before an anchor is blurred anew
+# Of a blur, by which it changes before an anchor is blurred anew, which moves what is aligned with it
+# a little.
+_CHANGE: Tolerance[float] = 0.4
 
 
 class MotionBlur:
