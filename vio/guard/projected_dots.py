@@ -150,7 +150,7 @@ def _correlate(before: Image, now: Image, rows: int, columns: int, out: FloatArr
         for block in range(rows * columns):
             v = block // columns * high
             u = block % columns * wide
-            a = b = aa = bb = ab = 0
+            a = b = aa = bb = ab = np.int64(0)
             for i in range(v, v + high):
                 for j in range(u, u + wide):
                     x = np.int64(before[part, i, j])

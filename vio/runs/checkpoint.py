@@ -82,7 +82,7 @@ def save_checkpoint(
         {"program": _program(), "inputs": dict(inputs or {}), "tree_bytes": len(tree)}
     ).encode()
     # The arrays are written from where they are: copies would double what a run needs.
-    parts = (head, b"\n", tree, *writer.blobs)
+    parts: tuple[bytes | memoryview, ...] = (head, b"\n", tree, *writer.blobs)
     checksum = reduce(lambda crc, part: zlib.crc32(part, crc), parts, 0)
     atomic_write_bytes(path, b"%08x" % checksum, *parts)
 
