@@ -177,6 +177,18 @@ def test_a_baseline_in_metres_in_the_place_of_a_product_is_doubted(
     assert not doubts or "if it is the baseline itself, 0.11 m" in doubts[0]
 
 
+@pytest.mark.parametrize("broken", ["K", "R", "P"])
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_matrix_written_from_integers_is_named(broken: str, side: int) -> None:
+    """As rosbags writes an array of int64 to a field of float64: the bits remain."""
+    infos = [_info("l", 0.0), _info("r", -40.0)]
+    assert rig_from_camera_infos(infos).cam1 is not None
+    bits = getattr(infos[side], broken).astype(np.int64).view(np.float64)
+    infos[side] = replace(infos[side], **{broken: bits})
+    with pytest.raises(CalibrationError, match=f"{'lr'[side]}: {broken} .* array of integers"):
+        rig_from_camera_infos(infos)
+
+
 # --- poses on the IMU that map the other way
 
 

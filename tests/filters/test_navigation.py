@@ -14,7 +14,7 @@ from vio.errors import EstimationError
 from vio.filters.imu_start import START_TILT_SIGMA_DEG
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
-from vio.geometry.lie import FloatArray, se3_exp
+from vio.geometry.lie import FloatArray, se3_exp, so3_exp
 from vio.imu.settings import DEFAULT_IMU, ImuSettings
 from vio.imu.standstill import NOISE_FACTOR, blocks_agree
 from vio.records import ImuSample, VelocitySample
@@ -59,6 +59,18 @@ def test_imu_noise_at_rest_is_that_of_integrated_white_noise(hz: int) -> None:
     np.testing.assert_allclose(
         np.diag(Q)[9:], np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) ** 2 * T, rtol=1e-9
     )
+
+
+def test_a_turn_on_the_spot_about_a_level_axis_gains_no_velocity() -> None:
+    """Half a sample of delay between gyro and accelerometer would make it 0.077 m/s."""
+    motion = ImuMotion(SETTINGS, DEFAULT_IMU)
+    rate = np.array([np.radians(90), 0.0, 0.0])
+    for k in range(101):
+        force = so3_exp(rate * k / 100).T @ [0.0, 0.0, DEFAULT_IMU.gravity_mps2]
+        motion.take(ImuSample(10_000_000 * k, rate, force))
+    moved = motion.advance(ORIGIN, 0, 1_000_000_000).nav
+    np.testing.assert_allclose(moved.velocity, 0, atol=1e-3)
+    np.testing.assert_allclose(moved.T_world_imu[:3, 3], 0, atol=1e-3)
 
 
 def test_imu_noise_does_not_depend_on_how_the_time_is_cut() -> None:

@@ -340,6 +340,11 @@ _CORRUPTED: dict[str, tuple[Callable[[Watched], list[ImuSample]], list[str], str
         ["accelerometer axes"],
         "[+y +z +x]",
     ),
+    "mirrored accelerometer": (
+        lambda it: _accel(it, lambda a: a * [1, -1, 1]),
+        ["accelerometer axes"],
+        "[+x -y +z]",
+    ),
     "gravity alone inverted": (
         lambda it: _gravity(it, -2),
         ["upside down"],
@@ -367,6 +372,19 @@ def test_corrupted_samples_give_exactly_their_finding(name: str, seed: int, moun
         "\n" not in f.message and f.seen in f.message and f.explanation in f.message for f in found
     )
     assert [f.certain for f in found] == [f.fault != "upside down" for f in found]
+
+
+@pytest.mark.parametrize(("seed", "mount"), [(0, "euroc"), (1, "forward")])
+def test_names_the_axis_along_which_gyro_and_accelerometer_are_mirrored(
+    seed: int, mount: str
+) -> None:
+    """As in the raw readings of a receiver that stores -y of both."""
+    it = _recording("room", seed, mount)
+    along = np.array([1, -1, 1])
+    samples = [replace(s, gyro=s.gyro * along, accel=s.accel * along) for s in it.samples]
+    (found,) = _watch(it, samples=samples)
+    assert found.fault == "gyro axes"
+    assert "[+x -y +z]" in found.explanation
 
 
 def test_biased_accelerations_without_gravity_are_not_taken_for_g() -> None:

@@ -242,8 +242,11 @@ def rig_from_camera_infos(
 
     Raises:
         CalibrationError: a camera is not calibrated (K or P of zeros; of one camera, the one that
-            applies), its lens is not read, or the two are no stereo pair.
+            applies), a matrix was written from integers, its lens is not read, or the two are no
+            stereo pair.
     """
+    for info in infos:
+        _check_numbers(info)
     sized = all(info.states_size for info in infos)
     infos = [info.of_images(image_size) for info in infos]
     rig = _rig(infos, rectified=rectified)
@@ -251,6 +254,20 @@ def rig_from_camera_infos(
     if doubt is not None:
         rig = rig.noting(doubt)
     return checked_rig(rig, infos[0].where, size_stated=sized)
+
+
+def _check_numbers(info: CameraInfo) -> None:
+    """Refuse a matrix of integers whose bits were written as those of doubles, which are subnormal,
+    as rosbags does with an array of int64.
+    """
+    for name, values in (("K", info.K), ("R", info.R), ("P", info.P)):
+        size = np.abs(values)
+        if ((size > 0) & (size < np.finfo(np.float64).smallest_normal)).any():
+            raise CalibrationError(
+                f"{info.where}: {name} holds numbers of the size of {size[size > 0].min():.1g}: it "
+                "was written from an array of integers; write it from one of float64, or give the "
+                "calibration with --calibration FILE"
+            )
 
 
 def _rig(infos: Sequence[CameraInfo], *, rectified: bool) -> Rig:
