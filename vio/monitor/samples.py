@@ -249,7 +249,8 @@ def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
     """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,)."""
     if not is_long_enough(times_ns):
         return Size(None, 1.0)
-    return _judge_median(*_usual_size(times_ns, accel))
+    step_s = float(np.median(np.diff(times_ns))) * S_PER_NS
+    return _judge_median(*_usual_size(times_ns, accel), step_s)
 
 
 def judge_exchange(times_ns: IntArray, values: FloatArray) -> InertialFinding | None:
@@ -287,14 +288,14 @@ def _usual_size(times_ns: IntArray, accel: FloatArray) -> tuple[float, float]:
     return usual, robust_sigma(size - usual) / max(usual, 1e-300)
 
 
-def _judge_median(usual: float, spread: float) -> Size:
-    """Judge a median magnitude and its relative spread."""
+def _judge_median(usual: float, spread: float, step_s: float) -> Size:
+    """Judge a median magnitude and its relative spread, of samples an interval apart."""
     if 0.5 < usual / _GRAVITY < 2.5:
         return Size(None, 1.0)
     seen = (
         f"the accelerometer's median magnitude is {usual:.4g} where gravity alone gives 9.8 m/s^2"
     )
-    named = _named_unit(usual, spread, seen)
+    named = _named_unit(usual, spread, seen) or _increments(usual, spread, seen, step_s)
     if named is not None:
         return named
     if usual < 0.5 * _GRAVITY and (spread >= 0.3 or usual < 0.5):
@@ -325,6 +326,23 @@ def _named_unit(usual: float, spread: float, seen: str) -> Size | None:
             clear = gravity > 1.0 or (abs(usual - 1.0) < 0.1 and spread < 0.06)
             return Size(finding, _GRAVITY / gravity, clear)
     return None
+
+
+def _increments(usual: float, spread: float, seen: str, step_s: float) -> Size | None:
+    """Return the judgement of a steady magnitude that is gravity times the interval between samples;
+    None: it is not.
+    """
+    excess = abs(usual / (_GRAVITY * step_s) - 1.0)
+    if not (spread < _SIZE.steady and excess < _SIZE.as_gravity):
+        return None
+    finding = InertialFinding(
+        "accelerometer units",
+        f"{seen}, and as much as gravity gives in the {step_s:.4g} s between samples",
+        "the readings are changes of velocity from sample to sample; divide them, and changes of angle, "
+        "by the time between samples",
+        factor=1.0 / step_s,
+    )
+    return Size(finding, 1.0 / step_s, excess < 0.1 and spread < 0.06)
 
 
 def gravity_removed(seen: str) -> InertialFinding:
