@@ -14,6 +14,7 @@ from vio.datasets import open_dataset
 from vio.datasets.tables import read_imu_table, read_velocity_table
 from vio.errors import DataError
 from vio.files.stamps import parse_stamps
+from vio.imu.two_sensors import parted_sensors
 
 HEADER = "timestamp [ns],wx,wy,wz,ax,ay,az"
 START_NS = 1700000000_000000000
@@ -125,6 +126,73 @@ def test_names_whose_nanoseconds_lack_their_zeros_are_said_to(tmp_path: Path) ->
     folder = make_plain(tmp_path, name=name, times=False, imu=False)
     with pytest.raises(DataError, match=r"lack their leading zeros.*write 1700000000\.012000000"):
         open_dataset(folder)
+
+
+@pytest.mark.parametrize("separator", [".", "_", "-"])
+@pytest.mark.parametrize(("digits", "unit"), [(9, "nanoseconds"), (6, "microseconds")])
+def test_counts_behind_seconds_in_names_need_their_zeros(
+    digits: int, unit: str, separator: str, tmp_path: Path
+) -> None:
+    """Names at 15 Hz, of which few end with a zero, and one of three after the second is short."""
+    ns = [1700000000_400000000 + 66_666_667 * k for k in range(20)]
+    part = lambda t: t % 10**9 // 10 ** (9 - digits)  # noqa: E731
+    names = {
+        "whole": lambda side, k: f"{ns[k] // 10**9}{separator}{part(ns[k]):0{digits}d}.png",
+        "cut": lambda side, k: f"{ns[k] // 10**9}{separator}{part(ns[k])}.png",
+    }
+    if separator != "." and digits == 6:
+        return  # a number of six digits may be a frame's
+    whole = make_plain(tmp_path / "whole", 20, name=names["whole"], times=False)
+    read = open_dataset(whole).recording.frame_times_ns
+    assert read.tolist() == [t // 10 ** (9 - digits) * 10 ** (9 - digits) for t in ns]
+    cut = make_plain(tmp_path / "cut", 20, name=names["cut"], times=False, imu=False)
+    short = next(t for t in ns if part(t) < 10 ** (digits - 1))
+    right = f"{short // 10**9}.{part(short):0{digits}d}"
+    with pytest.raises(DataError, match=f"{unit} lack their leading zeros.*write {right} for"):
+        open_dataset(cut)
+
+
+def test_names_of_a_time_and_a_frame_have_no_nanoseconds(tmp_path: Path) -> None:
+    """`1700000000_000012`: the number does not belong to the time."""
+    name = lambda side, k: f"{1700000000 + k}_{k + 12:06d}.png"  # noqa: E731
+    folder = make_plain(tmp_path, name=name, times=False, imu=False)
+    assert np.diff(open_dataset(folder).recording.frame_times_ns).tolist() == [10**8] * 3
+
+
+@pytest.mark.parametrize("separator", [" ", ","])
+@pytest.mark.parametrize("digits", ["", "09"])
+def test_lists_of_seconds_and_nanoseconds_are_read(
+    digits: str, separator: str, tmp_path: Path
+) -> None:
+    ns = [1700000000_400000000 + 66_666_667 * k for k in range(20)]
+    folder = make_plain(tmp_path, 20, imu=False, reference=False)
+    lines = [f"{t // 10**9}{separator}{t % 10**9:{digits}}" for t in ns]
+    (folder / "times.txt").write_text("\n".join(lines) + "\n")
+    assert open_dataset(folder).recording.frame_times_ns.tolist() == ns
+
+
+def test_samples_with_readings_of_one_sensor_each_are_joined(tmp_path: Path) -> None:
+    """As of a driver that gives two sensors in one form."""
+    stamps = 1700000000_000000000 + 2_500_000 * np.arange(400)
+    readings = np.column_stack([np.arange(400)] * 6) * 1e-3 + [0.1, 0.2, 0.3, 0.4, 0.5, 9.8]
+    readings[1::2, :3] = 0.0
+    readings[::2, 3:] = 0.0
+    lines = [
+        f"{t},{','.join(map(repr, row))}" for t, row in zip(stamps, readings.tolist(), strict=True)
+    ]
+    file = tmp_path / "imu.csv"
+    file.write_text("timestamp [ns],wx,wy,wz,ax,ay,az\n" + "\n".join(lines) + "\n")
+    record, notes = read_imu_table(file)
+    np.testing.assert_array_equal(record.times_ns, stamps[2::2])
+    np.testing.assert_allclose(record.gyro[:, 0], 0.1 + 1e-3 * np.arange(2, 400, 2))
+    np.testing.assert_allclose(record.accel[:, 2], 9.8 + 1e-3 * np.arange(2, 400, 2))
+    assert any("interpolated at the gyro's stamps" in note for note in notes)
+
+
+def test_zeros_of_a_sensor_that_fails_are_left_to_the_run() -> None:
+    readings = np.column_stack([np.arange(400)] * 6) * 1e-3 + 0.1
+    readings[1::3, :3] = 0.0
+    assert parted_sensors(readings[:, :3], readings[:, 3:]) is None
 
 
 def test_names_whose_last_zeros_were_cut_are_times(tmp_path: Path) -> None:

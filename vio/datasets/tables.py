@@ -36,6 +36,7 @@ from vio.files.units import (
 )
 from vio.geometry.lie import FloatArray
 from vio.imu.sampling import sampling_notes
+from vio.imu.two_sensors import JOINED, joined_record, parted_sensors
 from vio.records import NS_PER_S, BoolArray, ImuRecord, IntArray, VelocitySample
 
 _NUMBER = re.compile(
@@ -379,6 +380,15 @@ def read_imu_table(
         gyro if gyro_factor == 1.0 else gyro * gyro_factor,
         accel if accel_factor == 1.0 else accel * accel_factor,
     )
+    parts = parted_sensors(record.gyro, record.accel)
+    if parts is not None:
+        of_gyro, of_accel = parts
+        joined = joined_record(
+            (times_ns[of_gyro], record.gyro[of_gyro]), (times_ns[of_accel], record.accel[of_accel])
+        )
+        if joined is not None:
+            record = joined
+            notes.append(f"{path}: holds gyro and accelerometer in lines of their own: {JOINED}")
     return record, (*notes, *gyro_notes, *accel_notes, *sampling_notes(record, str(path)))
 
 
