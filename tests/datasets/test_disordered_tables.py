@@ -14,6 +14,7 @@ from vio.datasets import open_dataset
 from vio.datasets.tables import read_imu_table, read_velocity_table
 from vio.errors import DataError
 from vio.files.stamps import parse_stamps
+from vio.files.trajectories import read_trajectory
 from vio.imu.two_sensors import parted_sensors
 
 HEADER = "timestamp [ns],wx,wy,wz,ax,ay,az"
@@ -169,6 +170,31 @@ def test_lists_of_seconds_and_nanoseconds_are_read(
     lines = [f"{t // 10**9}{separator}{t % 10**9:{digits}}" for t in ns]
     (folder / "times.txt").write_text("\n".join(lines) + "\n")
     assert open_dataset(folder).recording.frame_times_ns.tolist() == ns
+
+
+@pytest.mark.parametrize("separator", [" ", "  ", "\t", "; "])
+def test_decimal_commas_stand_between_any_separators_but_commas(
+    separator: str, tmp_path: Path
+) -> None:
+    values = [[1700000000.25 + 0.005 * k, 0.1, -0.2, 0.3, 0.5, -9.25, 1 + k] for k in range(20)]
+    lines = [separator.join(f"{x:.3f}".replace(".", ",") for x in row) for row in values]
+    (tmp_path / "imu.csv").write_text("\n".join(lines) + "\n")
+    record, _ = read_imu_table(tmp_path / "imu.csv")
+    np.testing.assert_array_equal(np.hstack([record.gyro, record.accel]), [v[1:] for v in values])
+    assert record.times_ns[1] == 1700000000_255000000
+    turned = [[*row[:4], 0.0, 0.0, 0.0, 1.0] for row in values]
+    lines = [separator.join(f"{x:.3f}".replace(".", ",") for x in row) for row in turned]
+    (tmp_path / "poses.txt").write_text("\n".join(lines) + "\n")
+    found = read_trajectory(tmp_path / "poses.txt")
+    np.testing.assert_array_equal(found.T_world_body[:, :3, 3], [row[1:4] for row in values])
+
+
+def test_whole_numbers_between_commas_and_spaces_are_no_decimals(tmp_path: Path) -> None:
+    lines = [f"{START_NS + STEP_NS * k}, 1, 2, 3, 4, 5, 6" for k in range(20)]
+    (tmp_path / "imu.csv").write_text("\n".join(lines) + "\n")
+    record, _ = read_imu_table(tmp_path / "imu.csv")
+    assert record.times_ns[1] == START_NS + STEP_NS
+    assert np.hstack([record.gyro, record.accel])[1].tolist() == [1, 2, 3, 4, 5, 6]
 
 
 def test_samples_with_readings_of_one_sensor_each_are_joined(tmp_path: Path) -> None:

@@ -512,11 +512,7 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
         or _of_all_images(rows, pairs)
     )
     if chosen is None:
-        raise DataError(
-            f"{file} holds {len(rows)} times for {len(pairs)} image pairs; there must be one time "
-            "an image, or lines "
-            "'name time'; decimals need a point"
-        )
+        raise DataError(_unlike(file, rows, pairs))
     return parse_stamps(
         [text for _, text in chosen],
         lambda k: f"{file}, line {chosen[k][0]}",
@@ -524,6 +520,16 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
         pace=FRAME_PACE,
         doubts=doubts,
     )
+
+
+def _unlike(file: Path, rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs) -> str:
+    """Return how a list of times does not fit the images."""
+    held = f"{file} holds {len(rows)} times for {len(pairs)} image pairs"
+    if rows and len(rows) == len(pairs):
+        number, fields = next((row for row in rows if len(row[1]) != 1), rows[0])
+        shown = " ".join(fields)[:40]
+        held = f"{file}, line {number}: {shown!r} is not one time, nor the name of an image and one"
+    return f"{held}; there must be one time an image, or lines 'name time'; decimals need a point"
 
 
 def _seconds_and_nanoseconds(
