@@ -189,6 +189,18 @@ def test_decimal_commas_stand_between_any_separators_but_commas(
     np.testing.assert_array_equal(found.T_world_body[:, :3, 3], [row[1:4] for row in values])
 
 
+@pytest.mark.parametrize("head", ["", "type,timestamp,x,y,z\n"])
+def test_lines_of_sensors_by_their_names_are_to_be_parted(head: str, tmp_path: Path) -> None:
+    lines = [
+        f"{name},{START_NS + STEP_NS * k},0.1,0.2,0.3"
+        for k in range(20)
+        for name in ("GYRO", "ACC")
+    ]
+    (tmp_path / "imu.csv").write_text(head + "\n".join(lines) + "\n")
+    with pytest.raises(DataError, match=r"begins with a word: .* gyro\.csv and accel\.csv"):
+        read_imu_table(tmp_path / "imu.csv")
+
+
 def test_whole_numbers_between_commas_and_spaces_are_no_decimals(tmp_path: Path) -> None:
     lines = [f"{START_NS + STEP_NS * k}, 1, 2, 3, 4, 5, 6" for k in range(20)]
     (tmp_path / "imu.csv").write_text("\n".join(lines) + "\n")
