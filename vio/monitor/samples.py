@@ -43,11 +43,14 @@ class _SizeRules(NamedTuple):
     # of a gyro's readings that are an accelerometer's: from gravity, and their relative spread …
     as_gravity: float = 0.25
     steady: float = 0.3
+    # smaller ones are the Earth's in g, of which the images' metres know nothing
+    least_set_mps2: float = 1.3
     no_gravity: float = 0.5  # … and the accelerometer's at most, of gravity
 
 
 _SIZE = _SizeRules()
-_GRAVITY = 9.80665  # m/s^2, and what readings in mg have
+EARTH_GRAVITY_MPS2 = 9.80665
+_GRAVITY = EARTH_GRAVITY_MPS2
 _MILLI_G = 1000.0
 
 
@@ -245,12 +248,40 @@ def is_long_enough(times_ns: IntArray) -> bool:
     return bool((times_ns[-1] - times_ns[0]) * S_PER_NS >= _SIZE.min_s)
 
 
-def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
-    """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,)."""
+def judge_size(
+    times_ns: IntArray, accel: FloatArray, gravity_mps2: float = EARTH_GRAVITY_MPS2
+) -> Size:
+    """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,).
+
+    Args:
+        times_ns: increasing.
+        accel: readings.
+        gravity_mps2: as it is set, which may be another body's.
+    """
     if not is_long_enough(times_ns):
         return Size(None, 1.0)
     step_s = float(np.median(np.diff(times_ns))) * S_PER_NS
-    return _judge_median(*_usual_size(times_ns, accel), step_s)
+    usual, spread = _usual_size(times_ns, accel)
+    return _judge_setting(usual, spread, gravity_mps2) or _judge_median(usual, spread, step_s)
+
+
+def _judge_setting(usual: float, spread: float, gravity_mps2: float) -> Size | None:
+    """Judge a median magnitude by gravity that is set to another than the Earth's; None: it is not, or
+    the magnitude is neither.
+    """
+    if abs(gravity_mps2 / _GRAVITY - 1.0) < _SIZE.as_gravity or not spread < _SIZE.steady:
+        return None
+    if abs(usual / gravity_mps2 - 1.0) < _SIZE.as_gravity and gravity_mps2 > _SIZE.least_set_mps2:
+        return Size(None, 1.0)
+    if abs(usual / _GRAVITY - 1.0) > _SIZE.as_gravity:
+        return None
+    finding = InertialFinding(
+        "accelerometer units",
+        f"the accelerometer's median magnitude is {usual:.4g}, and gravity is set to "
+        f"{gravity_mps2:g} m/s^2 (imu.gravity_mps2)",
+        "the readings are the Earth's gravity in m/s^2: leave out the setting",
+    )
+    return Size(finding, 1.0)
 
 
 def judge_exchange(times_ns: IntArray, values: FloatArray) -> InertialFinding | None:
