@@ -374,7 +374,7 @@ def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
     """Suggest what to write for an unknown setting."""
     if key in _FIXED.get(prefix[:-1], "").split():
         return "; it is fixed since 0.3: remove it"
-    if prefix + key in (row.key for row in describe(root)):
+    if "." in key and prefix + key in (row.key for row in describe(root)):
         *parts, last = key.split(".")
         return f"; write it nested, as {': {'.join(parts)}: {{{last}: …{'}' * len(parts)}"
     near = _nearest_setting(key, names, prefix, root)
