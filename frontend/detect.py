@@ -432,13 +432,18 @@ def half_mask(mask: Image, shape: tuple[int, ...]) -> BoolArray:
     allowed.
 
     Raises:
-        ConfigError: the mask has another shape than the images.
+        ConfigError: the mask has another shape than the images, or excludes all of them.
     """
     if mask.shape != shape:
         raise ConfigError(
             f"frontend.klt.mask is {mask.shape[1]}x{mask.shape[0]}, but the images are "
             f"{shape[1]}x{shape[0]}; "
             "give a mask of the recording's size"
+        )
+    if not mask.any():
+        raise ConfigError(
+            "frontend.klt.mask is black all over, which excludes every pixel; make white what is to be "
+            "tracked (transparency counts for nothing)"
         )
     solid = np.asarray(cv2.erode(mask, np.ones((3, 3), np.uint8)))
     return np.asarray(solid[::2, ::2] > 0)

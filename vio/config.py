@@ -299,7 +299,10 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     try:
         values = read_yaml(text)
     except ValueError as error:
-        raise ConfigError(f"{path}: not valid YAML ({error})") from error
+        remedy = "; replace tabs by spaces" if "character '\\t'" in str(error) else ""
+        if text.startswith("%YAML:"):
+            remedy = "; remove the first line, which is OpenCV's"
+        raise ConfigError(f"{path}: not valid YAML ({error}){remedy}") from error
     if values is None:
         return {}
     if not isinstance(values, dict):
@@ -371,6 +374,9 @@ def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
     """Suggest what to write for an unknown setting."""
     if key in _FIXED.get(prefix[:-1], "").split():
         return "; it is fixed since 0.3: remove it"
+    if "." in key and prefix + key in (row.key for row in describe(root)):
+        *parts, last = key.split(".")
+        return f"; write it nested, as {': {'.join(parts)}: {{{last}: …{'}' * len(parts)}"
     near = _nearest_setting(key, names, prefix, root)
     if near is not None:
         return f"; did you mean '{near}'?"

@@ -366,6 +366,7 @@ def test_prints_a_table_with_the_path_of_the_plot(
         (["run", "{rec}", "--frontend", "magic"], "frontend.name is one of"),
         (["run", "{rec}", "--start", "400"], "past the last frame"),
         (["run", "{rec}", "--start", "5", "--stop", "5"], "no range"),
+        (["run", "{rec}", "--start", "-5"], "frames -5 to the last one are no range"),
         (["run", "{rec}", "--set", "vislam.iterations=0"], "at least 1"),
         (["run", "{rec}", "--out", "{tmp}/thesis"], "was not made by this program"),
         (["run", "{rec}", "--out", "{rec}"], "is a file"),

@@ -111,12 +111,27 @@ def test_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("- 1\n- 2\n", r"is a mapping of settings, not a list"),
         ("msckf:\n  clones: 5\nmsckf:\n  clones: 7\n", r"'msckf' is given twice"),
         ("vislam: [\n", r"not valid YAML"),
+        ("msckf:\n\tclones: 5\n", r"not valid YAML .*; replace tabs by spaces"),
+        ("%YAML:1.0\n---\nmotion: imu\n", r"remove the first line, which is OpenCV's"),
+        ("msckf:\n  clones: 1:30\n", r"takes a whole number, got '1:30'"),
+        ("imu:\n  gravity_mps2: 1:30.5\n", r"takes a number, got '1:30\.5'"),
+        ("msckf.clones: 8\n", r"write it nested, as msckf: \{clones: …\}"),
+        (
+            "frontend.grid.target_features: 300\n",
+            r"nested, as frontend: \{grid: \{target_features: …\}\}",
+        ),
         ("motion:\n", r"motion is one of auto"),
     ],
 )
 def test_reports_mistakes_in_the_file(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_config(_write(tmp_path, text))
+
+
+@pytest.mark.parametrize(("digits", "size"), [("010", 10), ("0x10", 16), ("+1_0", 10)])
+def test_whole_numbers_are_those_that_people_read(digits: str, size: int) -> None:
+    """To YAML 1.1 a leading zero is that of a number to the base of 8."""
+    assert load_config(overrides=[f"msckf.clones={digits}"]).msckf.clones == size
 
 
 @pytest.mark.parametrize(

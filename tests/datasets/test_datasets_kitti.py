@@ -395,7 +395,7 @@ BAD = [
     (
         _write("times.txt", "0\n0.1 0.2\n0.3\n0.4\n"),
         DataError,
-        r"holds 4 times for 4 image pairs; there must",
+        r"line 2: '0\.1 0\.2' is not one time, nor the name of an image and one; there must",
     ),
     (
         _remove("T_cam0_imu.txt"),

@@ -437,9 +437,9 @@ BAD = {
         "does not name gyro and accel",
     ),
     "an empty IMU": (_write("imu.csv", "#timestamp,wx,wy,wz,ax,ay,az\n"), "holds no line of data"),
-    "an IMU with decimal commas": (
-        _write("imu.csv", "time wx wy wz ax ay az\n1700000000 0,1 0,1 0,1 0,1 9,8 0,1\n"),
-        r"line 2, '1700000000 0,1 0,1 0,1 0,1 9,8 0,1', does not begin with a number \(decimals "
+    "an IMU with times of another form": (
+        _write("imu.csv", "time,wx,wy,wz,ax,ay,az\n12:00:00.5,0.1,0.1,0.1,0.1,9.8,0.1\n"),
+        r"line 2, '12:00:00\.5,0\.1,0\.1,0\.1,0\.1,9\.8,0\.1', does not begin with a number \(decimals "
         r"need a point\)",
     ),
     "gravity among the gyro's columns": (

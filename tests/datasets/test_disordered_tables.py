@@ -14,6 +14,8 @@ from vio.datasets import open_dataset
 from vio.datasets.tables import read_imu_table, read_velocity_table
 from vio.errors import DataError
 from vio.files.stamps import parse_stamps
+from vio.files.trajectories import read_trajectory
+from vio.imu.two_sensors import parted_sensors
 
 HEADER = "timestamp [ns],wx,wy,wz,ax,ay,az"
 START_NS = 1700000000_000000000
@@ -125,6 +127,110 @@ def test_names_whose_nanoseconds_lack_their_zeros_are_said_to(tmp_path: Path) ->
     folder = make_plain(tmp_path, name=name, times=False, imu=False)
     with pytest.raises(DataError, match=r"lack their leading zeros.*write 1700000000\.012000000"):
         open_dataset(folder)
+
+
+@pytest.mark.parametrize("separator", [".", "_", "-"])
+@pytest.mark.parametrize(("digits", "unit"), [(9, "nanoseconds"), (6, "microseconds")])
+def test_counts_behind_seconds_in_names_need_their_zeros(
+    digits: int, unit: str, separator: str, tmp_path: Path
+) -> None:
+    """Names at 15 Hz, of which few end with a zero, and one of three after the second is short."""
+    ns = [1700000000_400000000 + 66_666_667 * k for k in range(20)]
+    part = lambda t: t % 10**9 // 10 ** (9 - digits)  # noqa: E731
+    names = {
+        "whole": lambda side, k: f"{ns[k] // 10**9}{separator}{part(ns[k]):0{digits}d}.png",
+        "cut": lambda side, k: f"{ns[k] // 10**9}{separator}{part(ns[k])}.png",
+    }
+    if separator != "." and digits == 6:
+        return  # a number of six digits may be a frame's
+    whole = make_plain(tmp_path / "whole", 20, name=names["whole"], times=False)
+    read = open_dataset(whole).recording.frame_times_ns
+    assert read.tolist() == [t // 10 ** (9 - digits) * 10 ** (9 - digits) for t in ns]
+    cut = make_plain(tmp_path / "cut", 20, name=names["cut"], times=False, imu=False)
+    short = next(t for t in ns if part(t) < 10 ** (digits - 1))
+    right = f"{short // 10**9}.{part(short):0{digits}d}"
+    with pytest.raises(DataError, match=f"{unit} lack their leading zeros.*write {right} for"):
+        open_dataset(cut)
+
+
+def test_names_of_a_time_and_a_frame_have_no_nanoseconds(tmp_path: Path) -> None:
+    """`1700000000_000012`: the number does not belong to the time."""
+    name = lambda side, k: f"{1700000000 + k}_{k + 12:06d}.png"  # noqa: E731
+    folder = make_plain(tmp_path, name=name, times=False, imu=False)
+    assert np.diff(open_dataset(folder).recording.frame_times_ns).tolist() == [10**8] * 3
+
+
+@pytest.mark.parametrize("separator", [" ", ","])
+@pytest.mark.parametrize("digits", ["", "09"])
+def test_lists_of_seconds_and_nanoseconds_are_read(
+    digits: str, separator: str, tmp_path: Path
+) -> None:
+    ns = [1700000000_400000000 + 66_666_667 * k for k in range(20)]
+    folder = make_plain(tmp_path, 20, imu=False, reference=False)
+    lines = [f"{t // 10**9}{separator}{t % 10**9:{digits}}" for t in ns]
+    (folder / "times.txt").write_text("\n".join(lines) + "\n")
+    assert open_dataset(folder).recording.frame_times_ns.tolist() == ns
+
+
+@pytest.mark.parametrize("separator", [" ", "  ", "\t", "; "])
+def test_decimal_commas_stand_between_any_separators_but_commas(
+    separator: str, tmp_path: Path
+) -> None:
+    values = [[1700000000.25 + 0.005 * k, 0.1, -0.2, 0.3, 0.5, -9.25, 1 + k] for k in range(20)]
+    lines = [separator.join(f"{x:.3f}".replace(".", ",") for x in row) for row in values]
+    (tmp_path / "imu.csv").write_text("\n".join(lines) + "\n")
+    record, _ = read_imu_table(tmp_path / "imu.csv")
+    np.testing.assert_array_equal(np.hstack([record.gyro, record.accel]), [v[1:] for v in values])
+    assert record.times_ns[1] == 1700000000_255000000
+    turned = [[*row[:4], 0.0, 0.0, 0.0, 1.0] for row in values]
+    lines = [separator.join(f"{x:.3f}".replace(".", ",") for x in row) for row in turned]
+    (tmp_path / "poses.txt").write_text("\n".join(lines) + "\n")
+    found = read_trajectory(tmp_path / "poses.txt")
+    np.testing.assert_array_equal(found.T_world_body[:, :3, 3], [row[1:4] for row in values])
+
+
+@pytest.mark.parametrize("head", ["", "type,timestamp,x,y,z\n"])
+def test_lines_of_sensors_by_their_names_are_to_be_parted(head: str, tmp_path: Path) -> None:
+    lines = [
+        f"{name},{START_NS + STEP_NS * k},0.1,0.2,0.3"
+        for k in range(20)
+        for name in ("GYRO", "ACC")
+    ]
+    (tmp_path / "imu.csv").write_text(head + "\n".join(lines) + "\n")
+    with pytest.raises(DataError, match=r"begins with a word: .* gyro\.csv and accel\.csv"):
+        read_imu_table(tmp_path / "imu.csv")
+
+
+def test_whole_numbers_between_commas_and_spaces_are_no_decimals(tmp_path: Path) -> None:
+    lines = [f"{START_NS + STEP_NS * k}, 1, 2, 3, 4, 5, 6" for k in range(20)]
+    (tmp_path / "imu.csv").write_text("\n".join(lines) + "\n")
+    record, _ = read_imu_table(tmp_path / "imu.csv")
+    assert record.times_ns[1] == START_NS + STEP_NS
+    assert np.hstack([record.gyro, record.accel])[1].tolist() == [1, 2, 3, 4, 5, 6]
+
+
+def test_samples_with_readings_of_one_sensor_each_are_joined(tmp_path: Path) -> None:
+    """As of a driver that gives two sensors in one form."""
+    stamps = 1700000000_000000000 + 2_500_000 * np.arange(400)
+    readings = np.column_stack([np.arange(400)] * 6) * 1e-3 + [0.1, 0.2, 0.3, 0.4, 0.5, 9.8]
+    readings[1::2, :3] = 0.0
+    readings[::2, 3:] = 0.0
+    lines = [
+        f"{t},{','.join(map(repr, row))}" for t, row in zip(stamps, readings.tolist(), strict=True)
+    ]
+    file = tmp_path / "imu.csv"
+    file.write_text("timestamp [ns],wx,wy,wz,ax,ay,az\n" + "\n".join(lines) + "\n")
+    record, notes = read_imu_table(file)
+    np.testing.assert_array_equal(record.times_ns, stamps[2::2])
+    np.testing.assert_allclose(record.gyro[:, 0], 0.1 + 1e-3 * np.arange(2, 400, 2))
+    np.testing.assert_allclose(record.accel[:, 2], 9.8 + 1e-3 * np.arange(2, 400, 2))
+    assert any("interpolated at the gyro's stamps" in note for note in notes)
+
+
+def test_zeros_of_a_sensor_that_fails_are_left_to_the_run() -> None:
+    readings = np.column_stack([np.arange(400)] * 6) * 1e-3 + 0.1
+    readings[1::3, :3] = 0.0
+    assert parted_sensors(readings[:, :3], readings[:, 3:]) is None
 
 
 def test_names_whose_last_zeros_were_cut_are_times(tmp_path: Path) -> None:

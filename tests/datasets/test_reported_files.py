@@ -557,11 +557,13 @@ def test_readings_may_be_dated(tmp_path: Path) -> None:
     expected = _samples(make_plain(tmp_path / "apart"))
     folder = make_plain(tmp_path / "dated")
     head, *rows = (folder / "imu.csv").read_text().splitlines()
-    for form, separator in (("{}Z", ","), ("{}+00:00", ";"), ("{}", ",")):
+    zones = ("{}Z", ","), ("{}+00:00", ";"), ("{}", ","), ("{}+02:00", ","), ("{}-0930", ",")
+    for form, separator in zones:
+        ahead_ns = {"{}+02:00": 7200 * 10**9, "{}-0930": -34200 * 10**9}.get(form, 0)
         lines = [head.replace("#timestamp [ns]", "time").replace(",", separator)]
         for row in rows:
             stamp, *values = row.split(",")
-            date = np.datetime64(int(stamp), "ns").astype(str)
+            date = np.datetime64(int(stamp) + ahead_ns, "ns").astype(str)
             lines.append(separator.join([form.format(date), *values]))
         (folder / "imu.csv").write_text("\n".join(lines) + "\n")
         found = _samples(folder)

@@ -613,6 +613,10 @@ def test_rejects_invalid_mask(tmp_path: Path) -> None:
     cv2.imwrite(str(small), np.zeros((20, 30), dtype=np.uint8))
     with pytest.raises(ConfigError, match="mask is 30x20, but the images are 480x300"):
         run(FRAMES[:1], with_klt(mask=small))
+    black = tmp_path / "black.png"
+    cv2.imwrite(str(black), np.dstack([np.zeros((300, 480, 3)), np.full((300, 480), 255)]))
+    with pytest.raises(ConfigError, match="black all over, which excludes every pixel"):
+        run(FRAMES[:1], with_klt(mask=black))
     with pytest.raises(ConfigError, match="cannot be read as an image"):
         KltFrontend(CAMERA, with_klt(mask=tmp_path / "none.png"))
 

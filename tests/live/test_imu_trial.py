@@ -78,9 +78,11 @@ def _flight(
     return _Features(it, samples, recording)
 
 
-def _run(flight: _Features, motion: str = "imu", folder: Path | None = None) -> RunResult:
+def _run(
+    flight: _Features, motion: str = "imu", folder: Path | None = None, *settings: str
+) -> RunResult:
     control = RunControl() if folder is None else RunControl(GrowingFolder(folder, {}))
-    return run(flight, load_config(overrides=[f"motion={motion}"]), control=control)
+    return run(flight, load_config(overrides=[f"motion={motion}", *settings]), control=control)
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +125,14 @@ def test_without_a_factor_images_alone_go_on(alone: Trajectory) -> None:
     first, last = [line for line in result.warnings if "estimated again" in line]
     assert "is not used until" in first
     assert "the IMU is not used, and images alone go on" in last
+
+
+def test_gravity_that_is_set_to_another_planets_is_named(alone: Trajectory) -> None:
+    """The filter diverged, and clocks, axes and the baseline were blamed."""
+    result = _run(_flight(), "imu", None, "imu.gravity_mps2=3.7")
+    assert _worst_m(result.trajectory, alone) < 0.03
+    (line,) = [line for line in result.warnings if "leave out the setting" in line]
+    assert "gravity is set to 3.7 m/s^2 (imu.gravity_mps2)" in line
 
 
 class _Shown:

@@ -358,6 +358,27 @@ def _size_fault(magnitude: float) -> str:
     return "" if finding is None else finding.explanation
 
 
+@pytest.mark.parametrize(
+    ("shown", "is_set", "words"),
+    [
+        (9.81, 1.62, "leave out the setting"),
+        (9.81, 9.78, ""),
+        (1.62, 1.62, ""),
+        (3.71, 3.71, ""),
+        (1.0, 1.0, "in g"),  # the Earth's, whatever is set
+        (25.0, 25.0, ""),
+    ],
+)
+def test_gravity_may_be_set_to_another_planets(shown: float, is_set: float, words: str) -> None:
+    times_ns = (1e7 * np.arange(200)).astype(np.int64)
+    finding = judge_size(times_ns, np.tile([0.0, 0.0, shown], (200, 1)), is_set).finding
+    if words:
+        assert finding is not None
+        assert words in finding.explanation
+    else:
+        assert finding is None
+
+
 def _is_together(places: int) -> bool:
     """Whether features are said to lie together that are refused in so many places of an image of
     600 by 400 pixels, each 100 pixels from the next.

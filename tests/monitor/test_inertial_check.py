@@ -318,6 +318,11 @@ _CORRUPTED: dict[str, tuple[Callable[[Watched], list[ImuSample]], list[str], str
         ["accelerometer units"],
         "the unit or scale is unknown",
     ),
+    "increments": (
+        lambda it: _accel(it, lambda a: a / 200),
+        ["accelerometer units"],
+        "changes of velocity from sample to sample",
+    ),
     "no gravity": (lambda it: _gravity(it, -1), ["gravity removed"], "taken out"),
     "degrees": (
         lambda it: _gyro(it, np.degrees),

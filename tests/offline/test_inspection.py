@@ -9,6 +9,7 @@ import logging
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,9 +21,10 @@ import yaml
 
 from tests.commands import refused
 from tests.dataset_makers import FRAME_S, make_kitti
+from tests.euroc_maker import RADTAN_RIG
 from tests.frontend.test_frontend_scene import CAMERA
 from tests.guard.test_guard import shifted
-from tests.plain_maker import make_plain
+from tests.plain_maker import make_plain, rig_of
 from vio.cli import main
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageRecording
@@ -39,8 +41,8 @@ from vio.inspection.inspect import (
     clock_facts,
     inspect_recording,
 )
-from vio.inspection.pictures import GrayLevels, _image_faults
-from vio.records import Event, ImuDensities, ImuRecord
+from vio.inspection.pictures import GrayLevels, _image_faults, rows_part
+from vio.records import Event, ImuDensities, ImuRecord, StereoFrame
 
 
 def inspect(
@@ -88,6 +90,23 @@ def _turn_right_camera(folder: Path, w_deg: list[float]) -> None:
         image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
         size = image.shape[1], image.shape[0]
         cv2.imwrite(str(file), cv2.warpPerspective(image, H, size, borderMode=cv2.BORDER_REPLICATE))
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_a_focal_length_and_centre_that_both_lenses_have_are_named_where_rows_are_off(
+    copied: bool,
+) -> None:
+    rng = np.random.default_rng(5)
+    left = cv2.GaussianBlur(rng.integers(0, 256, (240, 320), dtype=np.uint8), (0, 0), 2.0)
+    left = cv2.normalize(left, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    frame = StereoFrame(0, 0, left, np.roll(left, (6, -12), axis=(0, 1)))
+    lens = replace(RADTAN_RIG.cam0, fu=250.0, fv=250.0, cu=160.0, cv=120.0, width=320, height=240)
+    other = replace(lens, cu=160.0 if copied else 161.5, coefficients=(-0.27, 0.06, 1e-4, 0.0))
+    rig = replace(RADTAN_RIG, cam0=lens, cam1=other)
+    part, _ = rows_part([frame], (rig, rig_of(rig).rectifier().camera), lambda done, of: None)
+    (fault,) = part.faults
+    assert fault.startswith("rows differ by -6.0 px")
+    assert ("those of one were written for both" in fault) == copied
 
 
 @pytest.mark.parametrize(

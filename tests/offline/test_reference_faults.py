@@ -294,3 +294,26 @@ def test_degrees_are_no_metres(tmp_path: Path) -> None:
             read_trajectory(file)
     file.write_text("time,x,y,z\n1700000000.0,48.1,11.5,510\n1700000001.0,48.2,11.6,511\n")
     assert len(read_trajectory(file)) == 2
+
+
+@pytest.mark.parametrize("name", ["estimate", "reference"])
+def test_placeholders_before_a_body_is_found_are_named(name: str) -> None:
+    """They were taken for another clock."""
+    whole = _trajectory()
+    poses = whole.T_world_body.copy()
+    poses[:, :3, 3] += [4.0, -2.0, 1.0]
+    moved = replace(whole, T_world_body=poses.copy())
+    poses[:7] = np.eye(4)
+    lost = replace(whole, T_world_body=poses)
+    given = (lost, moved) if name == "estimate" else (moved, lost)
+    (note,) = [note for note in evaluate(*given).notes if "placeholders" in note]
+    assert note.startswith(f"the first 7 poses of the {name} are the same to the bit")
+    assert not [note for note in evaluate(*given).notes if "clock" in note]
+
+
+def test_a_body_that_stands_at_its_start_has_no_placeholders() -> None:
+    whole = _trajectory()
+    poses = whole.T_world_body.copy()
+    poses[:7] = poses[7]
+    standing = replace(whole, T_world_body=poses)
+    assert not [n for n in evaluate(standing, standing).notes if "placeholders" in n]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vio.records import IntArray
+from vio.records import NS_PER_S, IntArray
 
 _DAY = r"(?P<y>19\d\d|20\d\d){0}(?P<mo>0[1-9]|1[0-2]){0}(?P<d>0[1-9]|[12]\d|3[01])"
 _CLOCK = r"(?P<h>[01]\d|2[0-3]){0}(?P<mi>[0-5]\d){0}(?P<s>[0-5]\d)"
@@ -20,14 +20,15 @@ _NAMED = re.compile(
     + _CLOCK.format(_PART)
     + r"(?:[-_.,]?(?P<part>\d{9}|\d{6}|\d{3}))?Z?(?:[_-][A-Za-z]+\d?)?"
 )
-# whose nanoseconds fit 64 bits; of other zones than UTC none
+# whose nanoseconds fit 64 bits
 _WRITTEN = re.compile(
-    r"(?P<day>(?:19|20|21)\d\d-\d\d-\d\d)[ T](?P<clock>\d\d:\d\d:\d\d(?:\.\d{0,9})?)(?:Z|\+00:?00)?"
+    r"(?P<day>(?:19|20|21)\d\d-\d\d-\d\d)[ T](?P<clock>\d\d:\d\d:\d\d(?:\.\d{0,9})?)"
+    r"(?:Z|(?P<sign>[+-])(?P<hours>[01]\d):?(?P<minutes>[0-5]\d))?"
 )
 
 
 def date_ns(text: str) -> int:
-    """Parse '2011-09-26 14:02:25.951199337', or with T and Z as of ISO 8601.
+    """Parse '2011-09-26 14:02:25.951199337', or with T, and Z or the zone, as of ISO 8601.
 
     Raises:
         ValueError: it is another form, or no date.
@@ -36,7 +37,11 @@ def date_ns(text: str) -> int:
     if found is None:
         raise ValueError(text)
     written = f"{found['day']}T{found['clock'].rstrip('.')}"
-    return int(np.datetime64(written, "ns").astype(np.int64))
+    local_ns = int(np.datetime64(written, "ns").astype(np.int64))
+    if found["sign"] is None:
+        return local_ns
+    ahead_s = 3600 * int(found["hours"]) + 60 * int(found["minutes"])
+    return local_ns - int(f"{found['sign']}1") * ahead_s * NS_PER_S
 
 
 def undated(line: str) -> str:

@@ -38,10 +38,11 @@ _TIMED = 100  # images, of which names that are times show it
 _LIST_FORM = "timestamp [ns], filename"
 _NUMBER = r"\d+(?:\.\d*)?(?:[eE][+-]?\d+)?"
 # `cam0_1403636579763555584`, `stereo_front_left_315966070522`, `1403636579763555584_left`,
-# `1700000001.33713`, `17000000013371ms`, and `000012_1403636579763555584`, with the number of the frame
+# `1700000001.33713`, `17000000013371ms`, `000012_1403636579763555584`, with the number of the frame, and
+# `1403636579_763555584`, seconds and nanoseconds
 _STAMP = re.compile(
     r"(?:(?:[A-Za-z]+\d?(?:[_-][A-Za-z]+\d?)*|(?P<number>\d{1,7}))[_-])?"
-    r"(?P<time>\d{10,19}|\d{1,10}\.\d{1,9})(?:_?(?P<unit>ns|us|ms|s))?"
+    r"(?P<time>\d{10,19}|\d{1,10}\.\d{1,9}|1\d{9}[_-]\d{1,9})(?:_?(?P<unit>ns|us|ms|s))?"
     r"(?:[_-][A-Za-z]+\d?)?"
 )
 # Since 1970: milliseconds to nanoseconds, or seconds with a point.
@@ -282,7 +283,14 @@ def _stamps_in_names(files: Sequence[Path]) -> tuple[list[str], str | None, bool
     units = {match["unit"] for match in found}
     if len(found) < len(files) or len(units) != 1:
         return None
-    return [match["time"] for match in found], units.pop(), any(match["number"] for match in found)
+    texts = [match["time"] for match in found]
+    apart = [re.fullmatch(r"(\d+)[_-](\d+)", text) for text in texts]
+    if any(apart):
+        # of nanoseconds a tenth has fewer digits without leading zeros; a frame's number has always fewer
+        if not all(apart) or 2 * sum(len(part[2]) == 9 for part in apart if part) < len(apart):
+            return None
+        texts = [f"{part[1]}.{part[2]}" for part in apart if part]
+    return texts, units.pop(), any(match["number"] for match in found)
 
 
 def _are_seconds(texts: Sequence[str]) -> bool:
@@ -494,6 +502,7 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
     ):
         return drive_times(file, np.array(numbers, dtype=np.int64))
     rows, stated = time_lines(file)
+    rows, stated = _seconds_and_nanoseconds(rows, stated)
     chosen = (
         _by_name_first(rows, pairs)
         or _by_name_last(rows, pairs)
@@ -503,11 +512,7 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
         or _of_all_images(rows, pairs)
     )
     if chosen is None:
-        raise DataError(
-            f"{file} holds {len(rows)} times for {len(pairs)} image pairs; there must be one time "
-            "an image, or lines "
-            "'name time'; decimals need a point"
-        )
+        raise DataError(_unlike(file, rows, pairs))
     return parse_stamps(
         [text for _, text in chosen],
         lambda k: f"{file}, line {chosen[k][0]}",
@@ -515,6 +520,33 @@ def times_of(file: Path, pairs: ImagePairs, doubts: list[str] | None = None) -> 
         pace=FRAME_PACE,
         doubts=doubts,
     )
+
+
+def _unlike(file: Path, rows: Sequence[tuple[int, list[str]]], pairs: ImagePairs) -> str:
+    """Return how a list of times does not fit the images."""
+    held = f"{file} holds {len(rows)} times for {len(pairs)} image pairs"
+    if rows and len(rows) == len(pairs):
+        number, fields = next((row for row in rows if len(row[1]) != 1), rows[0])
+        shown = " ".join(fields)[:40]
+        held = f"{file}, line {number}: {shown!r} is not one time, nor the name of an image and one"
+    return f"{held}; there must be one time an image, or lines 'name time'; decimals need a point"
+
+
+def _seconds_and_nanoseconds(
+    rows: list[tuple[int, list[str]]], stated: str | None
+) -> tuple[list[tuple[int, list[str]]], str | None]:
+    """Return lines of seconds since 1970 and nanoseconds as times in seconds; others as they are."""
+    if not all(
+        len(fields) == 2
+        and re.fullmatch(r"1\d{9}", fields[0])
+        and re.fullmatch(r"\d{1,9}", fields[1])
+        for _, fields in rows
+    ):
+        return rows, stated
+    # of nanoseconds a tenth is smaller; a number of frames is
+    if not rows or 2 * sum(int(fields[1]) >= 10**8 for _, fields in rows) < len(rows):
+        return rows, stated
+    return [(n, [f"{fields[0]}.{int(fields[1]):09d}"]) for n, fields in rows], "s"
 
 
 def _by_name_first(

@@ -195,9 +195,13 @@ def _pair_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
 def _named_layout(path: Path, folders: str) -> Layout:
     names = [name.strip() for name in folders.split(",")]
     sides = [path / name for name in names]
-    if len(names) != 2 or not all(_holds_images(folder) for folder in sides):
+    if (
+        len(set(names)) != 2
+        or len(names) != 2
+        or not all(_holds_images(folder) for folder in sides)
+    ):
         raise DataError(
-            f"{path}: dataset.folders is {folders!r}, which names no two folders of images; it "
+            f"{path}: dataset.folders is {folders!r}, which names no two folders of images, LEFT,RIGHT; it "
             f"holds {seen_folders(path)}"
         )
     return Layout(path, path, *sides)

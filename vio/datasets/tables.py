@@ -36,6 +36,7 @@ from vio.files.units import (
 )
 from vio.geometry.lie import FloatArray
 from vio.imu.sampling import sampling_notes
+from vio.imu.two_sensors import JOINED, joined_record, parted_sensors
 from vio.records import NS_PER_S, BoolArray, ImuRecord, IntArray, VelocitySample
 
 _NUMBER = re.compile(
@@ -61,6 +62,7 @@ _MAX_SHARED = 0.35
 _FINE = 0.1
 _MAX_LATE = 0.05  # share of lines that may have been written late
 _OWN_PLACE = 0.5  # of the usual interval that is free on both sides of such a line
+_WORD = re.compile(r"[A-Za-z_]+\d*")
 _OTHER_UNITS = {"rad/s": "deg/s or mdps", "m/s^2": "g or mg"}  # for messages
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 
@@ -183,7 +185,7 @@ def table_rows(
         yield number, fields
     if not is_data:
         raise DataError(
-            f"{path}: holds no line of data ({form}){above.unread}; copy it again, or remove it"
+            f"{path}: holds no line of data ({form}){above.unread or '; copy it again, or remove it'}"
         )
 
 
@@ -213,8 +215,8 @@ class _LinesAbove:
         is_comment = text.startswith("#")
         if not is_comment and _NUMBER.fullmatch(next(iter(split_cells(text)), "")):
             return False
-        if self.header and not is_comment:
-            self.unread = f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a point)"
+        if not self.unread:
+            self.unread = self._why_unread(number, text)
         cells = header_cells(text, self._columns)
         if cells:
             self.header = _with_units(self.header, cells)
@@ -222,6 +224,28 @@ class _LinesAbove:
         else:
             self._comments.append(text)
         return True
+
+    def _why_unread(self, number: int, text: str) -> str:
+        """Return why a line above the data may be data that is not read, and what to do; empty: it is
+        a comment, or the header.
+        """
+        cells = split_cells(text)
+        if cells and _WORD.fullmatch(cells[0]) and _are_numbers(cells[1:]):
+            return (
+                f"; line {number}, {text[:40]!r}, begins with a word: write the lines of each sensor "
+                "into a file of its own, gyro.csv and accel.csv (timestamp, x, y, z)"
+            )
+        if self.header and not text.startswith("#"):
+            return (
+                f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a "
+                "point); copy it again, or remove it"
+            )
+        return ""
+
+
+def _are_numbers(cells: Sequence[str]) -> bool:
+    """Whether cells are a stamp and three readings at least."""
+    return len(cells) > 3 and all(map(_NUMBER.fullmatch, cells))
 
 
 def _with_units(header: list[str], cells: list[str]) -> list[str]:
@@ -379,6 +403,15 @@ def read_imu_table(
         gyro if gyro_factor == 1.0 else gyro * gyro_factor,
         accel if accel_factor == 1.0 else accel * accel_factor,
     )
+    parts = parted_sensors(record.gyro, record.accel)
+    if parts is not None:
+        of_gyro, of_accel = parts
+        joined = joined_record(
+            (times_ns[of_gyro], record.gyro[of_gyro]), (times_ns[of_accel], record.accel[of_accel])
+        )
+        if joined is not None:
+            record = joined
+            notes.append(f"{path}: holds gyro and accelerometer in lines of their own: {JOINED}")
     return record, (*notes, *gyro_notes, *accel_notes, *sampling_notes(record, str(path)))
 
 

@@ -31,6 +31,7 @@ class _FaultRules(NamedTuple):
     steps: int = 200  # of the first search, on either side
     finer: int = 10  # steps on either side of the best one, twice
     min_jump_m: float = 0.01  # to the identity: below, a body may stand at its start
+    begun: float = 5.0  # of the largest further step, that a body does not jump by at its start
     max_arm_m: float = 5.0  # of a reference's point from the body that is estimated
     fits: Tolerance[int] = 10  # of a lever arm beside an alignment
 
@@ -56,7 +57,8 @@ def position_fault(
         T_est: (M, 4, 4) poses that were paired.
         T_ref: (M, 4, 4) the poses of the reference.
     """
-    if (lost := _placeholders(estimate)) is not None:
+    lost = _placeholders(estimate, "estimate") or _placeholders(reference, "reference")
+    if lost is not None:
         return lost
     x = T_est[:, :3, 3]
     y = T_ref[:, :3, 3]
@@ -202,27 +204,36 @@ def _beside_arm(
     return float(np.sqrt(np.mean(np.sum((y - moved) ** 2, axis=1)))), lever
 
 
-def _placeholders(estimate: Trajectory) -> str | None:
-    """Return the note on poses that are the identity to the bit amid others that are not; None:
-    there are none.
+def _placeholders(trajectory: Trajectory, name: str) -> str | None:
+    """Return the note on poses before the first one, or that are the identity to the bit amid others
+    that are not; None: there are none.
 
-    Where a body stands at its start they are the first ones.
+    Where a body stands at its start they are the first ones, and it moves on from there.
     """
-    alike = (estimate.T_world_body == np.eye(4)).all(axis=(1, 2))
-    others = np.flatnonzero(~alike)
-    if not len(others):
+    T = trajectory.T_world_body
+    moved = np.flatnonzero((T[0] != T).any(axis=(1, 2)))
+    if not len(moved):
         return None
-    lost = int(alike[others[0] :].sum())
-    first = int(others[0]) + int(np.argmax(alike[others[0] :]))
-    if not lost:
+    begun = int(moved[0])
+    steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+    jump_m = float(steps[begun - 1])
+    if jump_m > max(_FAULT.min_jump_m, _FAULT.begun * float(steps[begun:].max(initial=0.0))):
+        return (
+            f"the first {begun} poses of the {name} are the same to the bit, {jump_m:.3g} m from the "
+            "next one: placeholders from before the body was found; remove these rows"
+        )
+    alike = (np.eye(4) == T).all(axis=(1, 2))
+    alike[:begun] = False
+    if not alike.any():
         return None
-    jump_m = float(np.linalg.norm(estimate.positions[first - 1]))
+    first = int(np.argmax(alike))
+    jump_m = float(np.linalg.norm(trajectory.positions[first - 1]))
     if jump_m < _FAULT.min_jump_m:
         return None
     return (
-        f"{lost} poses of the estimate, from row {first} on, are the identity to the bit, {jump_m:.3g} m "
-        "from the one before: placeholders of frames without a pose, as some programs write where "
-        "they are lost; remove these rows"
+        f"{alike.sum()} poses of the {name}, from row {first} on, are the identity to the bit, "
+        f"{jump_m:.3g} m from the one before: placeholders of frames without a pose, as some programs "
+        "write where they are lost; remove these rows"
     )
 
 

@@ -34,6 +34,7 @@ _SIZES: tuple[tuple[TimeUnit, Decimal], ...] = (
 )
 _DECADES = 1000.0  # between two units
 _FEWEST_STEPS = 2  # which tell a unit: two frames may share an arrival
+_ODD_STEP = 0.5  # of the median interval: frames that jitter differ by less
 _SECONDS_AND_NANOSECONDS = re.compile(r"(\d{1,12})\.(\d{1,9})")
 
 
@@ -111,21 +112,34 @@ def parse_stamps(
 
 
 def check_digits(texts: Sequence[str], where: Callable[[int], str]) -> None:
-    """Raise DataError where nanoseconds were put behind the points of names, in any order, without
-    their leading zeros.
+    """Raise DataError where a count of nanoseconds, microseconds or milliseconds was put behind the
+    points of names, in any order, without its leading zeros.
 
-    Names whose zeros at the end were cut differ in length, too, and none ends with one.
+    Then no decimals begin with a zero, and entries are as far apart as counts and not as decimals.
+    Names whose zeros at the end were cut differ in length, too.
     """
-    ends = [text.partition(".")[2] for text in texts]
-    zeros = [k for k, end in enumerate(ends) if len(end) > 1 and end.endswith("0")]
-    shorter = [k for k in zeros if len(ends[k]) < max(map(len, ends))]
-    if shorter:
-        k = shorter[0]
-        whole = texts[k].partition(".")[0]
-        raise DataError(
-            f"{where(k)}: nanoseconds lack their leading zeros, as decimals of different length do "
-            f"that end with a zero; write {whole}.{int(ends[k]):09d} for {texts[k]}"
-        )
+    parts = [text.partition(".") for text in texts]
+    ends = [end for _, _, end in parts]
+    digits = max(map(len, ends))
+    shorter = next((k for k, end in enumerate(ends) if len(end) < digits), None)
+    if digits < 2 or shorter is None or any(len(end) > 1 and end[0] == "0" for end in ends):
+        return
+    counted = [f"{whole}.{end:0>{digits}}" for whole, _, end in parts]
+    if _odd_steps(counted) >= _odd_steps(texts):
+        return
+    unit = {3: "milliseconds", 6: "microseconds"}.get(digits, "nanoseconds")
+    raise DataError(
+        f"{where(shorter)}: {unit} lack their leading zeros, as entries are evenly apart only with "
+        f"them; write {counted[shorter]} for {texts[shorter]}"
+    )
+
+
+def _odd_steps(texts: Sequence[str]) -> int:
+    """Return how many intervals between times in seconds, in order, are far from the median one."""
+    times = np.sort([float(text) for text in texts])
+    steps = np.diff(times - times[0])
+    usual = np.median(steps) if len(steps) else 0.0
+    return int((np.abs(steps - usual) > _ODD_STEP * usual).sum())
 
 
 def _check_leading_zeros(

@@ -23,7 +23,7 @@ from vio.files.atomic import atomic_write_text
 from vio.files.pose_columns import PoseColumns, are_geographic, pose_columns
 from vio.files.stamps import POSE_PACE, parse_stamps
 from vio.files.text import exact_text, lines_of, seconds_text, whole_ns_stamps
-from vio.files.units import header_cells, split_cells
+from vio.files.units import header_cells, split_cells, with_decimal_points
 from vio.geometry.lie import (
     FloatArray,
     nearest_rotation,
@@ -436,6 +436,9 @@ def _read_table(path: Path) -> _Table:
     if "," in first and re.search(r"[;\t]", first) and all(map(_is_number, cells)):
         rows = [";".join(split_cells(row)) for row in rows]  # decimal commas
         return _Table(path, comments, rows, line_numbers, ";")
+    if with_decimal_points(first) is not None:
+        rows = [with_decimal_points(row) or row for row in rows]
+        first = rows[0]
     separator = "," if "," in first else ";" if ";" in first else None
     return _Table(path, comments, rows, line_numbers, separator)
 

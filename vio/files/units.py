@@ -61,8 +61,8 @@ _SPELLINGS = (
 def split_cells(text: str) -> list[str]:
     """Return the cells of a line, between commas, else semicolons, else white space.
 
-    Commas within numbers between semicolons or tabs are decimal points; quotes around cells are
-    left out.
+    Commas within all numbers between semicolons, tabs or white space are decimal points; quotes
+    around cells are left out.
     """
     text = text.replace('"', "")
     if "," in text:
@@ -75,16 +75,28 @@ def _cells_between(text: str, separator: str) -> list[str]:
 
 
 def _cells_with_decimal_commas(text: str) -> list[str]:
-    """Return the cells between semicolons, else tabs, where all are numbers with a decimal comma,
-    with points; else none.
+    """Return the cells between semicolons, else tabs, else white space, where all are numbers with a
+    decimal comma, with points; else none.
     """
     separator = next((s for s in (";", "\t") if s in text), None)
     if separator is None:
-        return []
-    cells = _cells_between(text, separator)
+        cells = text.split()
+        if len(cells) < 2 or any(cell.endswith(",") for cell in cells):  # between commas and spaces
+            return []
+    else:
+        cells = _cells_between(text, separator)
     if not all(_DECIMAL_COMMA.fullmatch(cell) for cell in cells):
         return []
     return [cell.replace(",", ".") for cell in cells]
+
+
+def with_decimal_points(text: str) -> str | None:
+    """Return a line of numbers with decimal commas, between white space, with points; None: it is
+    another.
+    """
+    if re.search(r"[;\t]", text) or "," not in text:
+        return None
+    return " ".join(_cells_with_decimal_commas(text)) or None
 
 
 def header_cells(text: str, columns: int) -> list[str]:

@@ -69,6 +69,26 @@ class _PlainLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+def _whole_number(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int | str:
+    """Return a whole number as YAML 1.2 has it, and people read it: to YAML 1.1 010 is 8, and 1:30
+    is 90.
+    """
+    digits = node.value.lstrip("+-").replace("_", "")
+    if ":" in digits:
+        return node.value
+    size = int(digits, 0) if digits[:2] in ("0x", "0b") else int(digits)
+    return -size if node.value.startswith("-") else size
+
+
+def _number(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> float | str:
+    """Return a number; text that YAML 1.1 takes for one to the base of 60 as it is."""
+    return node.value if ":" in node.value else loader.construct_yaml_float(node)
+
+
+_PlainLoader.add_constructor("tag:yaml.org,2002:int", _whole_number)
+_PlainLoader.add_constructor("tag:yaml.org,2002:float", _number)
+
+
 def read_yaml(text: str) -> Any:
     """Return the data of a YAML text.
 

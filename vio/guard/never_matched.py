@@ -61,8 +61,8 @@ class NeverMatched(Finder):
         self._reported = True
         message = (
             f"frame {index}: hardly any feature has a right match since the first frame "
-            f"({100 * share:.0f} %), so lengths are unknown; the right images may be turned, or not "
-            "belong to the left ones or the calibration (vio inspect)"
+            f"({100 * share:.0f} %), so lengths are unknown; the right images may be turned, "
+            "the left ones again, or not belong to the left ones or the calibration (vio inspect)"
         )
         figures = {"share": share}
         self._found.append(Finding(_CODE, message, index, self._since, lasts=True, figures=figures))

@@ -1,4 +1,6 @@
-"""A gyro and an accelerometer that have stamps of their own, as one record."""
+"""A gyro and an accelerometer that have stamps of their own, as one record: in two tables, or in
+samples of which each has the readings of one alone and zeros for the other's.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +22,35 @@ class _GapRules(NamedTuple):
 
 
 GAPS = _GapRules()
+
+
+class _MixedRules(NamedTuple):
+    """When each sample has readings of one sensor alone, and not one that fails now and then."""
+
+    min_share_of_each: float = 0.1
+    min_share_alone: float = 0.9
+
+
+_MIXED = _MixedRules()
+# what is noted of such samples
+JOINED = "they are joined, the acceleration interpolated at the gyro's stamps"
+
+
+def parted_sensors(gyro: FloatArray, accel: FloatArray) -> tuple[IntArray, IntArray] | None:
+    """Return the rows (M,) with readings of the gyro alone and those (K,) of the accelerometer alone,
+    zeros in the place of the other's; None: samples have readings of both.
+
+    Args:
+        gyro: (N, 3).
+        accel: (N, 3).
+    """
+    gyro_alone = ~accel.any(axis=1)
+    accel_alone = ~gyro.any(axis=1) & ~gyro_alone
+    fewer = min(gyro_alone.mean(), accel_alone.mean())
+    alone = (gyro_alone | accel_alone).mean()
+    if fewer < _MIXED.min_share_of_each or alone < _MIXED.min_share_alone:
+        return None
+    return np.flatnonzero(gyro_alone), np.flatnonzero(accel_alone)
 
 
 def joined_record(

@@ -187,7 +187,7 @@ def rows_part(
     if isinstance(found, NotObservable):
         return _unmatched_part(found, counts), None
     off = StereoError(found.rms_px, found.disparity_px)
-    faults = _rows_faults(found)
+    faults = _rows_faults(found, alike=pair is not None and _have_one_lens(pair[0]))
     if faults and (turn_deg := _turn_between(frames)):
         faults = [
             f"the right images are turned by about {turn_deg} degrees against the left ones: turn "
@@ -252,7 +252,21 @@ def _rows_facts(found: RowResiduals) -> dict[str, object]:
     }
 
 
-def _rows_faults(found: RowResiduals) -> list[str]:
+def _have_one_lens(rig: StereoRig) -> bool:
+    """Return whether two lenses that distort have one focal length and centre, as no two real ones
+    have to all digits.
+    """
+    numbers = [(c.fu, c.fv, c.cu, c.cv) for c in (rig.cam0, rig.cam1)]
+    return numbers[0] == numbers[1] and any(rig.cam0.coefficients)
+
+
+def _rows_faults(found: RowResiduals, *, alike: bool) -> list[str]:
+    """Return what rows are off by.
+
+    Args:
+        found: of all matches.
+        alike: whether the calibration has one focal length and centre for both lenses.
+    """
     if found.positive_disparity < _PICTURES.min_positive:
         return [
             f"{100 * (1 - found.positive_disparity):.0f} % of the matches are behind the cameras: "
@@ -260,9 +274,14 @@ def _rows_faults(found: RowResiduals) -> list[str]:
             "images are exchanged; exchange the folders or topics"
         ]
     if abs(found.median_px) + found.spread_px > _PICTURES.rows_fault_px:
+        cause = "a camera has been turned"
+        if alike:
+            cause = (
+                "the calibration has one focal length and centre for both lenses, as where those of "
+                "one were written for both, a camera has been turned"
+            )
         return [
-            f"rows differ by {found.median_px:+.1f} px with spread {found.spread_px:.1f} px: a "
-            "camera has been turned "
+            f"rows differ by {found.median_px:+.1f} px with spread {found.spread_px:.1f} px: {cause} "
             "since the calibration, left and right images are exchanged, the calibration is not "
             "that of these images, "
             "or they are not rectified; run `vio calibrate`, which finds which, and give its file "

@@ -302,6 +302,7 @@ def build_processor(
         trial=_trial(source, parts, backend, map),
         reading=source.reading_check(),
         extrinsics_known=config.msckf.calibrate_camera_imu not in ("extrinsics", "both"),
+        gravity_mps2=config.imu.gravity_mps2,
     )
     if map is None:
         session = None

@@ -14,6 +14,7 @@ from vio.findings import INTEGRITIES
 from vio.frontend.rolling_shutter import RollingShutter
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.imu.settings import DEFAULT_IMU
 from vio.live.imu_trial import AS_GIVEN, ImuTrial, corrected, corrected_all
 from vio.live.recovery import Recovery
 from vio.monitor.reading import ReadingCheck
@@ -60,12 +61,17 @@ class FramePipeline:
         trial: ImuTrial | None = None,
         reading: ReadingCheck | None = None,
         extrinsics_known: bool = True,
+        gravity_mps2: float = DEFAULT_IMU.gravity_mps2,
     ) -> None:
         self.frontend = parts.frontend
         self.selector = parts.selector
         self.backend = parts.backend
         self.monitor = RunMonitor(
-            camera, T_cam0_body, imu=motion == "imu", extrinsics_known=extrinsics_known
+            camera,
+            T_cam0_body,
+            imu=motion == "imu",
+            extrinsics_known=extrinsics_known,
+            gravity_mps2=gravity_mps2,
         )
         self._shutter = parts.shutter
         self._motion = motion

@@ -37,7 +37,14 @@ from vio.monitor.gyro_fit import (
 )
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.monitor.rotation_comparison import compare_rotations, judge_rotations
-from vio.monitor.samples import Samples, Size, is_long_enough, judge_exchange, judge_size
+from vio.monitor.samples import (
+    EARTH_GRAVITY_MPS2,
+    Samples,
+    Size,
+    is_long_enough,
+    judge_exchange,
+    judge_size,
+)
 from vio.monitor.turned_imu import Turn, judge_turn
 from vio.records import (
     ROTATION_NOT_COMPARABLE,
@@ -76,13 +83,19 @@ class InertialCheck:
     """
 
     def __init__(
-        self, camera: StereoCamera, T_cam0_imu: FloatArray, *, extrinsics_known: bool = True
+        self,
+        camera: StereoCamera,
+        T_cam0_imu: FloatArray,
+        *,
+        extrinsics_known: bool = True,
+        gravity_mps2: float = EARTH_GRAVITY_MPS2,
     ) -> None:
         """Create the check, for observations of a rectified pair and `T_cam0_imu` (4, 4) as the
         run uses it.
 
-        `extrinsics_known`: the filter does not estimate them.
+        `extrinsics_known`: the filter does not estimate them. `gravity_mps2`: as it is set.
         """
+        self._gravity_mps2 = gravity_mps2
         self._turns = extrinsics_known
         self._stereo = camera
         self._T = np.array(T_cam0_imu, dtype=np.float64)
@@ -169,7 +182,7 @@ class InertialCheck:
         times_ns, values = self._samples.so_far()
         if len(times_ns) < 2 or not is_long_enough(times_ns):
             return
-        size = judge_size(times_ns, values[:, 3:])
+        size = judge_size(times_ns, values[:, 3:], self._gravity_mps2)
         self._size_judged = True
         if (exchanged := judge_exchange(times_ns, values)) is not None:
             self._odd_size = exchanged.seen
@@ -218,7 +231,7 @@ class InertialCheck:
         times_ns, values = self._samples.table()
         if len(times_ns) < 2:
             return []
-        size = judge_size(times_ns, values[:, 3:])
+        size = judge_size(times_ns, values[:, 3:], self._gravity_mps2)
         self.imu_at_fault = size.finding is not None
         if (exchanged := judge_exchange(times_ns, values)) is not None:
             return [exchanged]  # nothing else can be said of such readings
@@ -366,7 +379,9 @@ class InertialCheck:
         motion = self._motion.joined()
         if len(times_ns) < 2 or motion is None:
             return
-        self.imu_at_fault = judge_size(times_ns, values[:, 3:]).finding is not None
+        self.imu_at_fault = (
+            judge_size(times_ns, values[:, 3:], self._gravity_mps2).finding is not None
+        )
         record = record_of(motion, times_ns, values)
         gyro_fit = fit_gyro(record, _EVALUATIONS.min_intervals_at_end)
         if gyro_fit is None:

@@ -17,6 +17,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import AS_READ
 from vio.imu.findings import ImuVerdict
+from vio.imu.settings import DEFAULT_IMU
 from vio.monitor.contradiction import ImuContradiction
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RefusalReport, RunHealth, is_corrected
@@ -59,6 +60,7 @@ class RunMonitor:
         *,
         imu: bool,
         extrinsics_known: bool = True,
+        gravity_mps2: float = DEFAULT_IMU.gravity_mps2,
     ) -> None:
         """Create the monitors of a rectified pair; extrinsics (4, 4), which the filter estimates if
         they are not known; `imu`: raw samples propagate the pose.
@@ -84,7 +86,12 @@ class RunMonitor:
         if imu:
             from vio.monitor.inertial import InertialCheck  # it loads scipy.optimize
 
-            self._inertial = InertialCheck(camera, T_cam0_body, extrinsics_known=extrinsics_known)
+            self._inertial = InertialCheck(
+                camera,
+                T_cam0_body,
+                extrinsics_known=extrinsics_known,
+                gravity_mps2=gravity_mps2,
+            )
         self._new: list[ImuSample] = []  # since the last frame
         self._frames = self._features = 0
         self._index = -1  # of the present frame, and of the one before it

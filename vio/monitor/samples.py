@@ -43,11 +43,14 @@ class _SizeRules(NamedTuple):
     # of a gyro's readings that are an accelerometer's: from gravity, and their relative spread …
     as_gravity: float = 0.25
     steady: float = 0.3
+    # smaller ones are the Earth's in g, of which the images' metres know nothing
+    least_set_mps2: float = 1.3
     no_gravity: float = 0.5  # … and the accelerometer's at most, of gravity
 
 
 _SIZE = _SizeRules()
-_GRAVITY = 9.80665  # m/s^2, and what readings in mg have
+EARTH_GRAVITY_MPS2 = 9.80665
+_GRAVITY = EARTH_GRAVITY_MPS2
 _MILLI_G = 1000.0
 
 
@@ -245,11 +248,40 @@ def is_long_enough(times_ns: IntArray) -> bool:
     return bool((times_ns[-1] - times_ns[0]) * S_PER_NS >= _SIZE.min_s)
 
 
-def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
-    """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,)."""
+def judge_size(
+    times_ns: IntArray, accel: FloatArray, gravity_mps2: float = EARTH_GRAVITY_MPS2
+) -> Size:
+    """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,).
+
+    Args:
+        times_ns: increasing.
+        accel: readings.
+        gravity_mps2: as it is set, which may be another body's.
+    """
     if not is_long_enough(times_ns):
         return Size(None, 1.0)
-    return _judge_median(*_usual_size(times_ns, accel))
+    step_s = float(np.median(np.diff(times_ns))) * S_PER_NS
+    usual, spread = _usual_size(times_ns, accel)
+    return _judge_setting(usual, spread, gravity_mps2) or _judge_median(usual, spread, step_s)
+
+
+def _judge_setting(usual: float, spread: float, gravity_mps2: float) -> Size | None:
+    """Judge a median magnitude by gravity that is set to another than the Earth's; None: it is not, or
+    the magnitude is neither.
+    """
+    if abs(gravity_mps2 / _GRAVITY - 1.0) < _SIZE.as_gravity or not spread < _SIZE.steady:
+        return None
+    if abs(usual / gravity_mps2 - 1.0) < _SIZE.as_gravity and gravity_mps2 > _SIZE.least_set_mps2:
+        return Size(None, 1.0)
+    if abs(usual / _GRAVITY - 1.0) > _SIZE.as_gravity:
+        return None
+    finding = InertialFinding(
+        "accelerometer units",
+        f"the accelerometer's median magnitude is {usual:.4g}, and gravity is set to "
+        f"{gravity_mps2:g} m/s^2 (imu.gravity_mps2)",
+        "the readings are the Earth's gravity in m/s^2: leave out the setting",
+    )
+    return Size(finding, 1.0)
 
 
 def judge_exchange(times_ns: IntArray, values: FloatArray) -> InertialFinding | None:
@@ -287,14 +319,14 @@ def _usual_size(times_ns: IntArray, accel: FloatArray) -> tuple[float, float]:
     return usual, robust_sigma(size - usual) / max(usual, 1e-300)
 
 
-def _judge_median(usual: float, spread: float) -> Size:
-    """Judge a median magnitude and its relative spread."""
+def _judge_median(usual: float, spread: float, step_s: float) -> Size:
+    """Judge a median magnitude and its relative spread, of samples an interval apart."""
     if 0.5 < usual / _GRAVITY < 2.5:
         return Size(None, 1.0)
     seen = (
         f"the accelerometer's median magnitude is {usual:.4g} where gravity alone gives 9.8 m/s^2"
     )
-    named = _named_unit(usual, spread, seen)
+    named = _named_unit(usual, spread, seen) or _increments(usual, spread, seen, step_s)
     if named is not None:
         return named
     if usual < 0.5 * _GRAVITY and (spread >= 0.3 or usual < 0.5):
@@ -325,6 +357,23 @@ def _named_unit(usual: float, spread: float, seen: str) -> Size | None:
             clear = gravity > 1.0 or (abs(usual - 1.0) < 0.1 and spread < 0.06)
             return Size(finding, _GRAVITY / gravity, clear)
     return None
+
+
+def _increments(usual: float, spread: float, seen: str, step_s: float) -> Size | None:
+    """Return the judgement of a steady magnitude that is gravity times the interval between samples;
+    None: it is not.
+    """
+    excess = abs(usual / (_GRAVITY * step_s) - 1.0)
+    if not (spread < _SIZE.steady and excess < _SIZE.as_gravity):
+        return None
+    finding = InertialFinding(
+        "accelerometer units",
+        f"{seen}, and as much as gravity gives in the {step_s:.4g} s between samples",
+        "the readings are changes of velocity from sample to sample; divide them, and changes of angle, "
+        "by the time between samples",
+        factor=1.0 / step_s,
+    )
+    return Size(finding, 1.0 / step_s, excess < 0.1 and spread < 0.06)
 
 
 def gravity_removed(seen: str) -> InertialFinding:

@@ -547,7 +547,8 @@ class _Loop:
 def _check_range(recording: Recording, start: int, stop: int | None) -> None:
     """Raise ConfigError where a range of frames is empty."""
     if start < 0 or (stop is not None and stop <= start):
-        raise ConfigError(f"frames {start} to {stop} are no range; give 0 <= start < stop")
+        last = "the last one" if stop is None else stop
+        raise ConfigError(f"frames {start} to {last} are no range; give 0 <= start < stop")
     if start >= len(recording.frame_times_ns):
         raise ConfigError(
             f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}"

@@ -31,22 +31,11 @@ from vio.datasets.rigs.camera_info import CameraInfo, region_of
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, se3_inverse
-from vio.imu.two_sensors import GAPS, joined_record
+from vio.imu.two_sensors import GAPS, JOINED, joined_record, parted_sensors
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, ImuRecord, IntArray, Trajectory, VelocitySample
 
 __all__ = ["BagIndex", "Stamps", "camera_info_of", "index_bag", "info_topic", "stamp_of"]
-
-
-class _MixedRules(NamedTuple):
-    """When a topic mixes the messages of two sensors."""
-
-    # least share of the messages with one sensor alone, where a topic mixes the two
-    min_share_of_each: float = 0.1
-    min_share_alone: float = 0.9  # and of both together
-
-
-_MIXED = _MixedRules()
 
 
 class _SharedStampRules(NamedTuple):
@@ -464,20 +453,15 @@ def _split_mixed(index: BagIndex, roles: Roles) -> None:
     if roles.imu is None or roles.accel is not None or len(index.imu) < 2:
         return
     values = np.array(index.imu.values)
-    gyro_alone = ~values[:, 3:].any(axis=1)
-    accel_alone = ~values[:, :3].any(axis=1) & ~gyro_alone
-    fewer = min(gyro_alone.mean(), accel_alone.mean())
-    if (
-        fewer < _MIXED.min_share_of_each
-        or (gyro_alone | accel_alone).mean() < _MIXED.min_share_alone
-    ):
+    parts = parted_sensors(values[:, :3], values[:, 3:])
+    if parts is None:
         return
+    of_gyro, of_accel = parts
     whole = index.imu
-    index.imu = whole.taken(np.flatnonzero(gyro_alone), slice(0, 3))
-    index.accel = whole.taken(np.flatnonzero(accel_alone), slice(3, 6))
+    index.imu = whole.taken(of_gyro, slice(0, 3))
+    index.accel = whole.taken(of_accel, slice(3, 6))
     index.notes.append(
-        f"{roles.imu.name} holds gyro and accelerometer in messages of their own: they are joined, "
-        "the acceleration interpolated at the gyro's stamps"
+        f"{roles.imu.name} holds gyro and accelerometer in messages of their own: {JOINED}"
     )
 
 

@@ -108,7 +108,8 @@ def load_rig(
     """
     file = Path(path)
     if not file.exists():
-        raise CalibrationError(f"{file} does not exist; give {KNOWN}")
+        seen_from = "" if file.is_absolute() else f" in {Path.cwd()}"
+        raise CalibrationError(f"{file} does not exist{seen_from}; give {KNOWN}")
     if file.is_dir():
         found = find_calibration(file)
         if found is None:
