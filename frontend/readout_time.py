@@ -44,7 +44,9 @@ class _ReadoutRules(NamedTuple):
     certain: float = 6.0  # standard deviations
     # of the readout time, by what it is off on six rendered rigs with usual errors
     usual: float = 0.1
-    least_s: float = 2e-3  # shorter readout times count as none
+    least_s: float = 2e-3  # shorter readout times count as none, and smaller differences from one
+    # share by which a stated one may be off, which is three times what one that is found is off
+    stated: float = 0.3
     sigma_s: float = (
         0.5e-3  # as precise as that, it is known, and a shorter one is none from then on
     )
@@ -101,10 +103,10 @@ class _Shown(NamedTuple):
 
 
 class ReadoutTime(Finder):
-    """Learns the readout time of a camera whose calibration states none."""
+    """Learns the readout time of a camera whose calibration states none, or tests a stated one."""
 
     def __init__(self, camera: StereoCamera, shares: RowShares) -> None:
-        """Prepare for frames of a rectified camera, whose heights are known."""
+        """Prepare for frames of a rectified camera, whose heights are known, as it shows them."""
         super().__init__()
         self._camera = camera
         self._shares = shares
@@ -113,8 +115,9 @@ class ReadoutTime(Finder):
         self._looked = 0
         self._sums: FloatArray = np.zeros(4)  # number, w, w r, w r^2
         self._motion: FloatArray = np.zeros((2, 6))  # the last velocity, acceleration, ...
-        self._near_s = 0.0  # that equations are linearised at
-        self._passes = 0
+        self._stated_s = camera.readout_s
+        self._near_s = camera.readout_s  # that equations are linearised at
+        self._passes = 1 if camera.readout_s else 0
         self._open = camera.kind != "mono" and shares.known
         self.readout_s = 0.0  # 0 until a rolling shutter is certain
 
@@ -211,16 +214,16 @@ class ReadoutTime(Finder):
         scatter = max((squares - product * found_s) / (count - 1.0), 1.0)
         sigma_s = math.sqrt(scatter / weight)
         step_s = (seen.time_ns - self._frames[-2].time_ns) / NS_PER_S
-        possible = _RULES.least_s < abs(found_s) < min(1.2 * step_s, MAX_READOUT_S)
-        if not (possible and abs(found_s) > _RULES.certain * sigma_s):
+        is_possible = abs(found_s) < min(1.2 * step_s, MAX_READOUT_S)
+        if self._stated_s:
+            if is_possible:
+                self._test(seen.frame_index, found_s, sigma_s)
+            return
+        is_clear = abs(found_s) > max(_RULES.least_s, _RULES.certain * sigma_s)
+        if not (is_possible and is_clear):
             self._open = sigma_s > _RULES.sigma_s or abs(found_s) > _RULES.least_s
             return
-        if self._passes < _RULES.passes:  # as the equations are not linear
-            self._passes += 1
-            self._near_s = found_s
-            self._sums[:] = 0.0
-            return
-        if sigma_s > max(_RULES.sigma_s, _RULES.precise * abs(found_s)):
+        if not self._is_precise(found_s, sigma_s):
             return
         self.readout_s = found_s
         self._open = False
@@ -236,6 +239,35 @@ class ReadoutTime(Finder):
         self._found.append(
             Finding("rolling-shutter", message, seen.frame_index, 0, figures=figures)
         )
+
+    def _is_precise(self, found_s: float, sigma_s: float) -> bool:
+        """Whether a readout time is known well enough, by equations linearised at it."""
+        if self._passes < _RULES.passes:  # as the equations are not linear
+            self._passes += 1
+            self._near_s = found_s
+            self._sums[:] = 0.0
+            return False
+        return sigma_s <= max(_RULES.sigma_s, _RULES.precise * abs(found_s))
+
+    def _test(self, index: int, found_s: float, sigma_s: float) -> None:
+        """Tell a stated readout time that is another one's, or that it is right."""
+        if not self._is_precise(found_s, sigma_s):
+            return
+        self._open = False
+        stated_s = self._stated_s
+        longer_s = max(abs(stated_s), abs(found_s))
+        limit_s = max(_RULES.least_s, _RULES.certain * sigma_s, _RULES.stated * longer_s)
+        if abs(found_s - stated_s) <= limit_s:
+            return
+        sigma_s = math.hypot(sigma_s, _RULES.usual * found_s)
+        figures = {"readout_ms": 1e3 * found_s, "sigma_ms": 1e3 * sigma_s}
+        message = (
+            f"frame {index}: the stated readout time of {1e3 * stated_s:.1f} ms does not fit how "
+            f"features move where the velocity changes, which shows {1e3 * found_s:.1f} +/- "
+            f"{1e3 * sigma_s:.1f} ms (0: a global shutter); correct frontend.readout_ms, or the "
+            "calibration that states it"
+        )
+        self._found.append(Finding("readout-contradicted", message, index, 0, figures=figures))
 
 
 def moved_by(p: FloatArray, twists: FloatArray) -> FloatArray:

@@ -60,7 +60,7 @@ class RollingShutter:
     """Moves the features of each frame to the time of its middle row."""
 
     def __init__(self, camera: StereoCamera, rectifier: Rectifier | None = None) -> None:
-        """Prepare for the images of a camera; without a `readout_s`, that is looked for.
+        """Prepare for the images of a camera; its `readout_s` is tested, and looked for without.
 
         Args:
             camera: rectified.
@@ -72,7 +72,7 @@ class RollingShutter:
         self._camera = camera
         self._readout_s = camera.readout_s
         self._shares = RowShares(camera, rectifier)
-        self._search = None if camera.readout_s else ReadoutTime(camera, self._shares)
+        self._search = ReadoutTime(camera, self._shares)
         if camera.readout_s and not self._shares.known:
             raise ConfigError(
                 "a rolling shutter needs the height of the images, which the recording does not "
@@ -84,7 +84,7 @@ class RollingShutter:
 
     def take_findings(self) -> tuple[Finding, ...]:
         """Return the findings since the last call."""
-        return () if self._search is None else self._search.take_findings()
+        return self._search.take_findings()
 
     def corrected(self, seen: Observations) -> Observations:
         """Return a frame's features at the time of its middle row; as they are, while no readout
@@ -93,8 +93,8 @@ class RollingShutter:
         Features without depth are moved by how far their pixels have moved since the last frame.
         What cannot be moved, as there is no velocity yet, is left out, but for the middle rows.
         """
-        if self._search is not None and not self._readout_s:
-            self._search.frame(seen)
+        self._search.frame(seen)
+        if not self._readout_s:
             self._readout_s = self._search.readout_s
             if not self._readout_s:
                 return seen

@@ -110,6 +110,11 @@ CODES: dict[str, Code] = {
         "rows are exposed one after the other; from then on features are moved to one time",
         "set frontend.readout_ms",
     ),
+    "readout-contradicted": Code(
+        "unusable",
+        "how features move shows another readout time of the shutter than is stated",
+        "correct frontend.readout_ms, or leave it out",
+    ),
     "shutter-put-right": Code(
         "nominal",
         "rows are exposed one after the other, and the run began again with that put right",

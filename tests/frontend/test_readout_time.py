@@ -54,8 +54,8 @@ def _seen(
     return observations(index, round(1e9 * _STEP_S * index), ids, z, np.ones(len(z), np.bool_))
 
 
-def _search(frames: list[Observations]) -> ReadoutTime:
-    search = ReadoutTime(_CAMERA, RowShares(_CAMERA, None))
+def _search(frames: list[Observations], stated_s: float = 0.0) -> ReadoutTime:
+    search = ReadoutTime(replace(_CAMERA, readout_s=stated_s), RowShares(_CAMERA, None))
     for seen in frames:
         search.frame(seen)
     return search
@@ -89,9 +89,33 @@ def test_a_global_shutter_is_known_as_one(noise_px: float) -> None:
     assert not shutter.take_findings()
 
 
+@pytest.mark.parametrize(
+    ("stated_s", "readout_s"), [(0.02, 0.0), (0.02, -0.02), (0.02, 0.01), (-0.01, 0.02)]
+)
+def test_a_stated_time_that_is_not_the_cameras_is_named(stated_s: float, readout_s: float) -> None:
+    search = _search([_seen(k, _shaken, readout_s) for k in range(160)], stated_s)
+    (finding,) = search.take_findings()
+    assert (finding.code, finding.effect, finding.since) == ("readout-contradicted", "unusable", 0)
+    assert finding.figures["readout_ms"] == pytest.approx(1e3 * readout_s, rel=0.1, abs=0.5)
+    assert f"the stated readout time of {1e3 * stated_s:.1f} ms" in finding.message
+    assert not search.is_rolling  # what is stated is used
+    assert AS_READ.adding(finding) is AS_READ
+
+
+@pytest.mark.parametrize("readout_s", [0.02, -0.02, 0.005])
+def test_a_stated_time_that_is_about_the_cameras_is_not(readout_s: float) -> None:
+    frames = [_seen(k, _shaken, readout_s) for k in range(160)]
+    for share in (0.85, 1.0, 1.15):
+        assert not _search(frames, share * readout_s).take_findings()
+    search = _search(frames, readout_s)
+    assert not search._open  # no more work
+
+
 def test_a_steady_velocity_shows_nothing() -> None:
     for readout_s in (0.0, 0.02):
-        assert not _search([_seen(k, _steady, readout_s) for k in range(80)]).is_rolling
+        frames = [_seen(k, _steady, readout_s) for k in range(80)]
+        assert not _search(frames).is_rolling
+        assert not _search(frames, 0.02).take_findings()
 
 
 def test_what_else_moves_pixels_is_no_readout_time() -> None:

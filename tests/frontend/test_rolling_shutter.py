@@ -215,13 +215,15 @@ def _run(dataset: _Kept, readout_ms: str) -> tuple[RunResult, float]:
 
 
 def _shutters(findings: Iterable[Finding]) -> list[str]:
-    return [f.code for f in findings if "shutter" in f.code]
+    return [f.code for f in findings if "shutter" in f.code or "readout" in f.code]
 
 
 def test_a_run_finds_the_readout_time_and_is_like_one_of_a_global_shutter(
     plan: Simulation, rolled: _Kept
 ) -> None:
-    at_once, exposed_at_once = _run(_Kept(replace(plan, effects=CLEAN)), "null")
+    global_shutter = _Kept(replace(plan, effects=CLEAN))
+    at_once, exposed_at_once = _run(global_shutter, "null")
+    wrongly, as_wrongly_stated = _run(global_shutter, "20")
     as_rolled, uncorrected = _run(rolled, "0")  # states a global shutter
     stated, corrected = _run(rolled, "20")
     found, by_itself = _run(rolled, "null")
@@ -230,6 +232,8 @@ def test_a_run_finds_the_readout_time_and_is_like_one_of_a_global_shutter(
     assert by_itself < uncorrected / 3
     assert not _shutters((*at_once.findings, *as_rolled.findings, *stated.findings))
     assert _shutters(found.findings) == ["shutter-put-right"]
+    assert as_wrongly_stated > 8 * exposed_at_once
+    assert _shutters(wrongly.findings) == ["readout-contradicted"]
     assert found.repair.readout_s == pytest.approx(0.02, rel=0.1)
     assert {e.integrity for e in found.estimates} == {"nominal"}
     calibrated = found.calibrated_rig()
