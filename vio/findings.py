@@ -208,6 +208,11 @@ CODES: dict[str, Code] = {
         "a frame shows another view than the one before",
         "add an IMU; keep recordings apart",
     ),
+    "image-geometry-changed": Code(
+        "unusable",
+        "images are scaled, stretched or cropped otherwise than at first",
+        "keep size, crop and zoom of the cameras, or run the parts apart",
+    ),
     "tracks-disagree": Code(
         "degraded", "tracks fit no common motion", "mask what moves with the rig"
     ),
