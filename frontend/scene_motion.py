@@ -22,6 +22,7 @@ from vio.frontend.moving_object import (
 )
 from vio.frontend.object_report import ObjectReport
 from vio.frontend.outliers import Consensus, RansacProblem
+from vio.frontend.rig_in_view import RigInView
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, project
 from vio.records import BoolArray, IntArray, TrackPrior
@@ -109,6 +110,7 @@ class SceneMotion:
 
     def __init__(self) -> None:
         self._report = ObjectReport()
+        self._rig = RigInView()
         # (M, 3) current cam0 frame, metres: what was in view when the last points that are older
         # than an object were lost; None: there are such points
         self._view: FloatArray | None = None
@@ -122,7 +124,7 @@ class SceneMotion:
 
     def take_findings(self) -> tuple[Finding, ...]:
         """Return the findings since the last call."""
-        return self._report.take_findings()
+        return self._report.take_findings() + self._rig.take_findings()
 
     def choose(
         self,
@@ -145,6 +147,8 @@ class SceneMotion:
         """
         expected = None if prior is None else prior.motion
         measured = None if prior is None else prior.measured_motion
+        by_sensor = None if measured is None else measured.T_curr_prev
+        self._rig.see(index, problem, points.p_prev, points.pixels, found, by_sensor)
         voting = voters(points.age)
         chosen = choose_motion(
             problem,

@@ -1,0 +1,117 @@
+"""Parts of the rig that show more features than the scene behind them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.frontend.test_frontend_outliers import CAMERA, LIMIT_PX, make_problem, scene
+from vio.findings import Finding
+from vio.frontend.outliers import Consensus, pixel_errors
+from vio.frontend.rig_in_view import RigInView
+from vio.geometry.lie import FloatArray, se3_exp, transform_points
+from vio.geometry.stereo import project
+
+STEP = se3_exp([0.0, 0.0, -0.5, 0.0, 0.02, 0.0])  # T_curr_prev of a rig that moves
+REST = np.eye(4)
+CLOSE = (1.0, 2.0)
+FAR = (4.0, 30.0)
+
+
+def _moved(p: FloatArray, T: FloatArray, seed: int) -> FloatArray:
+    """Pixels (N, 2) of points (N, 3) after a motion, with noise."""
+    rng = np.random.default_rng(seed)
+    uv: FloatArray = project(CAMERA, transform_points(T, p))[:, :2]
+    return uv + rng.normal(0.0, 0.1, uv.shape)
+
+
+def _see(
+    check: RigInView,
+    index: int,
+    stays: FloatArray,
+    moves: FloatArray,
+    motions: tuple[FloatArray, FloatArray] = (REST, STEP),
+    *,
+    measured: FloatArray | None = None,
+    scatter_px: float = 0.0,
+) -> tuple[Finding, ...]:
+    """What is found in a frame whose consensus is that of the first points (N, 3) and motion."""
+    p = np.concatenate([stays, moves])
+    uv = np.concatenate([_moved(stays, motions[0], index), _moved(moves, motions[1], index)])
+    rng = np.random.default_rng(index)
+    uv[len(stays) :] += rng.uniform(-scatter_px, scatter_px, (len(moves), 2))
+    found = Consensus(motions[0], pixel_errors(CAMERA, motions[0], p, uv) <= LIMIT_PX)
+    check.see(index, make_problem(), p, uv, found, measured)
+    return check.take_findings()
+
+
+def _found(
+    frames: int = 12,
+    stay: tuple[float, float] = CLOSE,
+    move: tuple[float, float] = FAR,
+    count: int = 40,
+    motion: FloatArray = STEP,
+    measured: FloatArray | None = None,
+    scatter_px: float = 0.0,
+) -> list[tuple[int | None, bool]]:
+    check = RigInView()
+    found = []
+    for k in range(1, frames):
+        points = scene(200, k, stay), scene(count, 100 + k, move)
+        motions = (REST, motion)
+        found += _see(check, k, *points, motions, measured=measured, scatter_px=scatter_px)
+    return [(f.frame, f.ended) for f in found]
+
+
+def test_a_scene_that_moves_behind_what_stays_is_named_in_the_fifth_frame() -> None:
+    assert _found() == [(5, False)]
+
+
+def test_what_moves_in_front_of_a_rig_at_standstill_is_an_object() -> None:
+    assert _found(stay=FAR, move=CLOSE) == []
+
+
+def test_a_sensor_that_measures_standstill_is_believed() -> None:
+    assert _found(measured=REST) == []
+    assert _found(measured=STEP) == [(5, False)]
+
+
+@pytest.mark.parametrize(("count", "named"), [(40, True), (13, True), (8, False)])
+def test_few_points_do_not_tell(count: int, named: bool) -> None:
+    assert bool(_found(count=count)) == named
+
+
+def test_points_that_move_each_by_itself_are_no_scene() -> None:
+    """As leaves, or wrong matches."""
+    assert _found(motion=REST, scatter_px=60.0) == []
+
+
+def test_a_rig_at_standstill_that_moves_off_has_none_in_view() -> None:
+    check = RigInView()
+    none = np.zeros((0, 3))
+    for k in range(1, 20):
+        T = REST if k < 8 else STEP
+        assert not _see(check, k, scene(200, k, FAR), none, (T, T))
+    # nor does it later, when it waits beside something that passes behind a fence
+    for k in range(20, 40):
+        assert not _see(check, k, scene(200, k, CLOSE), scene(40, 100 + k, FAR))
+
+
+def test_single_frames_do_not_tell() -> None:
+    check = RigInView()
+    none = np.zeros((0, 3))
+    for k in range(1, 40):
+        moves = none if k % 3 else scene(40, 100 + k, FAR)
+        assert not _see(check, k, scene(200, k, CLOSE), moves)
+
+
+def test_it_ends_once_the_consensus_moves() -> None:
+    check = RigInView()
+    found = []
+    for k in range(1, 20):
+        motions = (REST, STEP) if k < 10 else (STEP, STEP)
+        found += _see(check, k, scene(200, k, CLOSE), scene(40, 100 + k, FAR), motions)
+    assert [(f.code, f.frame, f.since, f.ended) for f in found] == [
+        ("rig-in-view", 5, 0, False),
+        ("rig-in-view", 14, None, True),
+    ]
