@@ -10,7 +10,7 @@ import pytest
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.monitor.image_geometry import ImageGeometry
+from vio.monitor.image_geometry import ImageGeometry, _between
 from vio.records import Observations, observations
 
 CAMERA = StereoCamera(400, 400, 320, 240, 0.1, width=640, height=480)
@@ -109,6 +109,18 @@ def test_the_motion_of_a_rig_is_none(
         _frame(k, p, step=step, sigma_px=0.3, disparity_off_px=disparity_off_px) for k in range(5)
     ]
     assert _found(frames) == []
+
+
+def test_what_a_wrong_calibration_shows_in_each_pair_of_frames_is_none() -> None:
+    ahead = np.array([0.0, 0.0, 0.4, 0.0, 0.0, 0.0])
+    p = _points(1, 3.0, 12.0)
+    frames = [_frame(k, p, step=ahead, disparity_off_px=2.5) for k in range(6)]
+    first, second = (_between(CAMERA, *frames[k : k + 2]) for k in (1, 2))
+    assert first is not None and first.is_clear  # control: by itself, each pair shows a change
+    assert second is not None and second.is_clear
+    assert _found(frames[1:]) == []
+    changed = [_frame(5, p, CHANGES[0], step=ahead, disparity_off_px=2.5)]
+    assert [f.frame for f in _found(frames[:5] + changed)] == [5]
 
 
 @pytest.mark.parametrize("share", [0.2, 0.4])

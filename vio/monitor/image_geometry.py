@@ -8,6 +8,7 @@ motion, where features lie far from where they were predicted.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -67,7 +68,7 @@ class ImageGeometry:
         """Prepare for the frames of a rectified camera."""
         self._camera = camera
         self._has_depth = camera.kind != "mono"
-        self._last: Observations | None = None
+        self._frames = deque[Observations](maxlen=3)
         # (4,) factors of columns and rows, and shifts in px, since the first frame
         self._since_first = _NONE.copy()
         self._changed = False  # as reported
@@ -76,15 +77,21 @@ class ImageGeometry:
         """Return what a frame shows, whose innovation over its standard deviation is given; None:
         no feature was predicted.
         """
-        before = self._last
-        self._last = seen
-        if before is None or not self._has_depth:
+        frames = self._frames
+        frames.append(seen)
+        if len(frames) < 3 or not self._has_depth:
             return []
         is_off = innovation_ratio is not None and innovation_ratio >= _RULES.min_sigmas
-        if not is_off and len(seen) > _RULES.left_share * len(before):
+        if not is_off and len(seen) > _RULES.left_share * len(frames[1]):
             return []
-        change = _between(self._camera, before, seen)
+        change = _between(self._camera, frames[1], seen)
         if change is None or not change.is_clear:
+            return []
+        usual = _between(self._camera, frames[0], frames[1])
+        if usual is None:
+            return []
+        change = _Change(change.value - usual.value, np.maximum(change.limit, usual.limit))
+        if not change.is_clear:
             return []
         factors = 1.0 + change.value[:2]
         self._since_first[:2] *= factors
