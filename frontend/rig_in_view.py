@@ -1,15 +1,16 @@
-"""Whether what stays in its place since the first frame is a part of the rig, in front of a scene that
-moves.
+"""Whether what stays at its pixels, since the first frame or since all else was lost, is a part of the
+rig and not the scene.
 
 An arm, a bonnet or the cabin around a camera may show more features than the scene. Then they win
 the consensus of each frame, the scene's are left out as outliers, and the rig seems to stand still.
-At standstill objects move, too, but those are nearer than the scene behind them.
+At standstill objects move, too, but those are nearer than the scene behind them, and cover a part of
+the image. What comes onto a window or a lens at once may leave no feature of the scene at all.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import depth_of
 from vio.numerics.robust import median
 from vio.records import BoolArray
+
+if TYPE_CHECKING:
+    from vio.frontend.scene_motion import MovedPoints
 
 
 class _RigRules(NamedTuple):
@@ -31,9 +35,16 @@ class _RigRules(NamedTuple):
     min_points: int = 12  # of the outliers, that follow another motion
     min_share: float = 0.05  # of all points
     rigid_share: float = 0.6  # of the outliers
-    nearer: float = 0.8  # depth of the points that stay, over that of the others, at most
+    # depth of the points that stay, over that of the others, at most, or …
+    nearer: float = 0.8
+    spread: float = 0.7  # … how far the others lie apart in rows and columns, over those, at least
     recent_frames: int = 10
     frames: int = 5  # of them, in which this holds
+    # Points of the last frame that the next one has, over all of them: as usual at least, and at most
+    # where the view is replaced.
+    usual_share: float = 0.5
+    lost_share: float = 0.25
+    min_before: int = 30  # points of the last frame
 
 
 _RIG = _RigRules()
@@ -46,58 +57,67 @@ class RigInView(Finder):
 
     def __init__(self) -> None:
         super().__init__()
+        self._since = 0  # frame from which the consensus is watched
+        self._replaced = False  # in that frame, all else was lost, and nothing has moved since
         self._moved = 0  # frames in which the consensus moves
         self._recent = deque[bool](maxlen=_RIG.recent_frames)
         self._reported = False
+        self._last: tuple[int, int, bool] | None = None  # frame, points, and whether as usual
+
+    def replace(self, index: int) -> None:
+        """Take that the scene is gone in a frame that should still show it."""
+        if self._reported:
+            return
+        self._since = index
+        self._replaced = True
+        self._moved = 0
+        self._recent.clear()
 
     def see(
         self,
         index: int,
         problem: RansacProblem,
-        p_prev: FloatArray,
-        pixels: FloatArray,
+        points: MovedPoints,
         found: Consensus,
         measured: FloatArray | None,
     ) -> None:
-        """Take the consensus over points (N, 3) of the frame before and pixels (N, 2), and the motion
-        (4, 4) that a sensor measures; None: none does.
+        """Take the consensus over the points of a frame, and the motion (4, 4) that a sensor
+        measures; None: none does.
         """
         if self._moved >= _RIG.moved_frames:
             return
-        flow_px = pixel_errors(problem.camera, _STILL, p_prev, pixels)
+        flow_px = pixel_errors(problem.camera, _STILL, points.p_prev, points.pixels)
         stays = found.inliers
         if not stays.any() or median(flow_px[stays]) > _RIG.still_px:
             self._moves(index)
             return
         scene = ~stays & (flow_px > problem.limit_px)
-        behind = self._is_behind(problem, p_prev, pixels, stays, scene)
-        if behind and measured is not None:
-            off_px = pixel_errors(problem.camera, measured, p_prev[stays], pixels[stays])
-            behind = median(off_px) > problem.limit_px  # else it stands still, by the sensor
-        self._recent.append(behind)
+        is_rig = self._replaced or _is_scene(problem, points, stays, scene)
+        if is_rig and measured is not None:
+            off_px = pixel_errors(
+                problem.camera, measured, points.p_prev[stays], points.pixels[stays]
+            )
+            is_rig = median(off_px) > problem.limit_px  # else it stands still, by the sensor
+        self._recent.append(is_rig)
         if not self._reported and sum(self._recent) >= _RIG.frames:
             self._report(index, float(scene.mean()))
 
-    def _is_behind(
-        self,
-        problem: RansacProblem,
-        p_prev: FloatArray,
-        pixels: FloatArray,
-        stays: BoolArray,
-        scene: BoolArray,
-    ) -> bool:
-        """Whether points (N,) that move follow one motion, behind those that stay."""
-        count = int(scene.sum())
-        if count < max(_RIG.min_points, _RIG.min_share * len(scene)):
+    def is_lost(self, index: int, points: MovedPoints, found: Consensus) -> bool:
+        """Return whether hardly a point of the last frame is in this one, as most were before."""
+        last = self._last
+        count = int(np.count_nonzero(found.inliers))
+        if last is None:
+            self._last = index, count, False
             return False
-        depth = depth_of(problem.camera, p_prev)
-        if median(depth[stays]) > _RIG.nearer * median(depth[scene]):
-            return False
-        _, follows = best_motion(problem, p_prev[scene], pixels[scene], _STILL[None])
-        return int(follows.sum()) >= max(_RIG.min_points, _RIG.rigid_share * count)
+        before, usual_count, usual = last
+        again = int(np.count_nonzero(found.inliers & (points.age >= index - before)))
+        as_usual = again >= _RIG.usual_share * usual_count
+        self._last = index, count, as_usual
+        return usual and usual_count >= _RIG.min_before and again < _RIG.lost_share * usual_count
 
     def _moves(self, index: int) -> None:
         self._moved += 1
+        self._replaced = False
         if self._reported and self._moved >= _RIG.moved_frames:
             message = (
                 f"frame {index}: the points that stayed at the same pixels are not used any more"
@@ -106,10 +126,33 @@ class RigInView(Finder):
 
     def _report(self, index: int, share: float) -> None:
         self._reported = True
-        message = (
-            f"frame {index}: {100 * share:.0f} % of the points move together, behind others that have "
-            "stayed at the same pixels since the first frame: parts of the rig are taken for the "
-            "scene, or a rig that stands still looks at something that moves behind it"
+        what = (
+            f"{100 * share:.0f} % of the points move together, behind or all over others that have "
+            f"stayed at the same pixels since frame {self._since}: parts of the rig or a reflection "
+            "are taken for the scene, or a rig that stands still looks at something that moves"
         )
+        if self._replaced:
+            what = (
+                f"what was seen before frame {self._since} is gone, and what is seen since stays at "
+                "the same pixels: a pattern on a window or a lens, or a covered camera, is taken for "
+                "the scene"
+            )
+        message = f"frame {index}: {what}"
         figures = {"scene_share": share}
-        self._found.append(Finding(_CODE, message, index, 0, lasts=True, figures=figures))
+        self._found.append(Finding(_CODE, message, index, self._since, lasts=True, figures=figures))
+
+
+def _is_scene(
+    problem: RansacProblem, points: MovedPoints, stays: BoolArray, scene: BoolArray
+) -> bool:
+    """Whether points (N,) that move follow one motion, behind or all over those that stay."""
+    count = int(scene.sum())
+    if count < max(_RIG.min_points, _RIG.min_share * len(scene)):
+        return False
+    depth = depth_of(problem.camera, points.p_prev)
+    if median(depth[stays]) > _RIG.nearer * median(depth[scene]):
+        apart_px = points.pixels[scene].std(axis=0)
+        if (apart_px < _RIG.spread * points.pixels[stays].std(axis=0)).any():
+            return False
+    _, follows = best_motion(problem, points.p_prev[scene], points.pixels[scene], _STILL[None])
+    return int(follows.sum()) >= max(_RIG.min_points, _RIG.rigid_share * count)

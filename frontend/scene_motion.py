@@ -85,12 +85,14 @@ class _Scene:
     p_prev: FloatArray  # (N, 3) metres, cam0 frame of the frame before
     motion: Consensus
 
-    def share_in_view(self, camera: StereoCamera, frames: int) -> float:
-        """The share of the scene's points that the left image shows so many frames later, if the
-        motion goes on.
-        """
+    def is_in_view(self, camera: StereoCamera, index: int) -> bool:
+        """Whether a later frame should still show the scene's points, if the motion goes on."""
+        frames = index - self.index
+        if frames > _VIEW.extrapolated_frames:
+            return False
         T = np.linalg.matrix_power(self.motion.T_curr_prev, frames + 1)
-        return _share_in_view(camera, transform_points(T, self.p_prev[self.motion.inliers]))
+        p = transform_points(T, self.p_prev[self.motion.inliers])
+        return _share_in_view(camera, p) > _VIEW.kept_share
 
     def goes_on(self, camera: StereoCamera, T: FloatArray, p_prev: FloatArray) -> bool:
         """Whether pixels of points (N, 3) move both by a motion (4, 4) and by that of the scene: what
@@ -148,7 +150,11 @@ class SceneMotion:
         expected = None if prior is None else prior.motion
         measured = None if prior is None else prior.measured_motion
         by_sensor = None if measured is None else measured.T_curr_prev
-        self._rig.see(index, problem, points.p_prev, points.pixels, found, by_sensor)
+        is_lost = self._rig.is_lost(index, points, found)
+        if is_lost and (self._scene is None or self._scene.is_in_view(problem.camera, index)):
+            self._rig.replace(index)
+        else:
+            self._rig.see(index, problem, points, found, by_sensor)
         voting = voters(points.age)
         chosen = choose_motion(
             problem,
@@ -226,11 +232,7 @@ class SceneMotion:
         if scene is None or measured or self._unseen < _VIEW.unseen_frames:
             return
         self._scene = None
-        frames = index - scene.index
-        if (
-            frames <= _VIEW.extrapolated_frames
-            and scene.share_in_view(camera, frames) > _VIEW.kept_share
-        ):
+        if scene.is_in_view(camera, index):
             self._report.lost(index, scene.index)
 
     def _has_passed(
