@@ -10,19 +10,17 @@ the image. What comes onto a window or a lens at once may leave no feature of th
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from vio.findings import Finder, Finding
+from vio.frontend.moving_object import MovedPoints
 from vio.frontend.outliers import Consensus, RansacProblem, best_motion, pixel_errors
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import depth_of
 from vio.numerics.robust import median
 from vio.records import BoolArray
-
-if TYPE_CHECKING:
-    from vio.frontend.scene_motion import MovedPoints
 
 
 class _RigRules(NamedTuple):

@@ -14,6 +14,7 @@ from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.frontend.moving_object import (
     MIN_POINTS,
+    MovedPoints,
     TwoMotions,
     choose_motion,
     one_motion_explains,
@@ -25,19 +26,7 @@ from vio.frontend.outliers import Consensus, RansacProblem
 from vio.frontend.rig_in_view import RigInView
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, project
-from vio.records import BoolArray, IntArray, TrackPrior
-
-
-@dataclass(frozen=True, slots=True)
-class MovedPoints:
-    """Points of known depth, and where the current frame shows them."""
-
-    p_prev: FloatArray  # (N, 3) triangulated in the previous frame, metres, previous cam0 frame
-    pixels: FloatArray  # (N, 2) left pixels in the current frame
-    age: IntArray  # (N,) frames for which each has been static
-
-    def __len__(self) -> int:
-        return len(self.p_prev)
+from vio.records import BoolArray, TrackPrior
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from tests.guards import lines_of
 from vio.frontend.frame_images import FrameImages
 from vio.frontend.frames import usable_prior
 from vio.frontend.moving_object import (
+    MovedPoints,
     TwoMotions,
     choose_motion,
     one_motion_explains,
@@ -32,7 +33,7 @@ from vio.frontend.object_report import ObjectReport
 from vio.frontend.outliers import Consensus, pixel_errors, rigid_consensus
 from vio.frontend.patches import ImageLevels
 from vio.frontend.right_images import RightImages
-from vio.frontend.scene_motion import MovedPoints, SceneMotion
+from vio.frontend.scene_motion import SceneMotion
 from vio.frontend.settings import DisparitySettings
 from vio.frontend.static_features import StaticFeatures
 from vio.frontend.stereo_fit import StereoFit

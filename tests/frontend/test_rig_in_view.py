@@ -7,9 +7,9 @@ import pytest
 
 from tests.frontend.test_frontend_outliers import CAMERA, LIMIT_PX, make_problem, scene
 from vio.findings import Finding
+from vio.frontend.moving_object import MovedPoints
 from vio.frontend.outliers import Consensus, pixel_errors
 from vio.frontend.rig_in_view import RigInView
-from vio.frontend.scene_motion import MovedPoints
 from vio.geometry.lie import FloatArray, se3_exp, transform_points
 from vio.geometry.stereo import project
 
