@@ -178,3 +178,12 @@ def test_few_features_that_scatter_show_nothing() -> None:
     for seed in range(20):
         p = _points(seed, 2.0, 8.0, 30)
         assert _found([_frame(k, p, sigma_px=1.0) for k in range(4)]) == []
+
+
+@pytest.mark.parametrize(("sigma_px", "named"), [(0.15, True), (1.5, False)])
+def test_a_change_that_is_not_known_well_is_not_named(sigma_px: float, named: bool) -> None:
+    """As of features among which wrong ones were left."""
+    p = _points(1, 2.0, 8.0, 60)
+    change = (0.9, 0.9, 0.0, 0.0)
+    frames = [_frame(k, p, change if k >= 3 else NONE, sigma_px=sigma_px) for k in range(4)]
+    assert bool(_found(frames)) == named
