@@ -25,11 +25,12 @@ from vio.frontend.align import (
 from vio.frontend.columns import joined, take
 from vio.frontend.detect import spread_evenly
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output, usable_prior
+from vio.frontend.moving_object import MovedPoints
 from vio.frontend.outliers import MotionPriors, RansacProblem, predicted_motion, static_tracks
 from vio.frontend.patches import inside
 from vio.frontend.prediction import moved_pixels, prior_pixels
 from vio.frontend.right_camera import most_contradict
-from vio.frontend.scene_motion import MovedPoints, SceneMotion
+from vio.frontend.scene_motion import SceneMotion
 from vio.frontend.settings import FrontendSettings, MatchSettings
 from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, EpipolarRowModel
 from vio.frontend.tracks import ANCHOR_RADIUS_PX

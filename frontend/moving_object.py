@@ -94,6 +94,18 @@ _TORN_SHARE = 0.9  # of the points of either part of a torn image that are on it
 
 
 @dataclass(frozen=True, slots=True)
+class MovedPoints:
+    """Points of known depth, and where the current frame shows them."""
+
+    p_prev: FloatArray  # (N, 3) triangulated in the previous frame, metres, previous cam0 frame
+    pixels: FloatArray  # (N, 2) left pixels in the current frame
+    age: IntArray  # (N,) frames for which each has been static
+
+    def __len__(self) -> int:
+        return len(self.p_prev)
+
+
+@dataclass(frozen=True, slots=True)
 class TwoMotions:
     """The camera's motion, and that of the other large group of points if there is one."""
 

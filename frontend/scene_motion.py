@@ -14,6 +14,7 @@ from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.frontend.moving_object import (
     MIN_POINTS,
+    MovedPoints,
     TwoMotions,
     choose_motion,
     one_motion_explains,
@@ -22,21 +23,10 @@ from vio.frontend.moving_object import (
 )
 from vio.frontend.object_report import ObjectReport
 from vio.frontend.outliers import Consensus, RansacProblem
+from vio.frontend.rig_in_view import RigInView
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, project
-from vio.records import BoolArray, IntArray, TrackPrior
-
-
-@dataclass(frozen=True, slots=True)
-class MovedPoints:
-    """Points of known depth, and where the current frame shows them."""
-
-    p_prev: FloatArray  # (N, 3) triangulated in the previous frame, metres, previous cam0 frame
-    pixels: FloatArray  # (N, 2) left pixels in the current frame
-    age: IntArray  # (N,) frames for which each has been static
-
-    def __len__(self) -> int:
-        return len(self.p_prev)
+from vio.records import BoolArray, TrackPrior
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +74,14 @@ class _Scene:
     p_prev: FloatArray  # (N, 3) metres, cam0 frame of the frame before
     motion: Consensus
 
-    def share_in_view(self, camera: StereoCamera, frames: int) -> float:
-        """The share of the scene's points that the left image shows so many frames later, if the
-        motion goes on.
-        """
+    def is_in_view(self, camera: StereoCamera, index: int) -> bool:
+        """Whether a later frame should still show the scene's points, if the motion goes on."""
+        frames = index - self.index
+        if frames > _VIEW.extrapolated_frames:
+            return False
         T = np.linalg.matrix_power(self.motion.T_curr_prev, frames + 1)
-        return _share_in_view(camera, transform_points(T, self.p_prev[self.motion.inliers]))
+        p = transform_points(T, self.p_prev[self.motion.inliers])
+        return _share_in_view(camera, p) > _VIEW.kept_share
 
     def goes_on(self, camera: StereoCamera, T: FloatArray, p_prev: FloatArray) -> bool:
         """Whether pixels of points (N, 3) move both by a motion (4, 4) and by that of the scene: what
@@ -109,6 +101,7 @@ class SceneMotion:
 
     def __init__(self) -> None:
         self._report = ObjectReport()
+        self._rig = RigInView()
         # (M, 3) current cam0 frame, metres: what was in view when the last points that are older
         # than an object were lost; None: there are such points
         self._view: FloatArray | None = None
@@ -122,7 +115,7 @@ class SceneMotion:
 
     def take_findings(self) -> tuple[Finding, ...]:
         """Return the findings since the last call."""
-        return self._report.take_findings()
+        return self._report.take_findings() + self._rig.take_findings()
 
     def choose(
         self,
@@ -145,6 +138,12 @@ class SceneMotion:
         """
         expected = None if prior is None else prior.motion
         measured = None if prior is None else prior.measured_motion
+        by_sensor = None if measured is None else measured.T_curr_prev
+        is_lost = self._rig.is_lost(index, points, found)
+        if is_lost and (self._scene is None or self._scene.is_in_view(problem.camera, index)):
+            self._rig.replace(index)
+        else:
+            self._rig.see(index, problem, points, found, by_sensor)
         voting = voters(points.age)
         chosen = choose_motion(
             problem,
@@ -222,11 +221,7 @@ class SceneMotion:
         if scene is None or measured or self._unseen < _VIEW.unseen_frames:
             return
         self._scene = None
-        frames = index - scene.index
-        if (
-            frames <= _VIEW.extrapolated_frames
-            and scene.share_in_view(camera, frames) > _VIEW.kept_share
-        ):
+        if scene.is_in_view(camera, index):
             self._report.lost(index, scene.index)
 
     def _has_passed(

@@ -6,7 +6,7 @@ import numpy as np
 
 from vio.findings import Finding
 from vio.frontend.frame_images import FrameImages
-from vio.frontend.moving_object import static_by_prediction
+from vio.frontend.moving_object import MovedPoints, static_by_prediction
 from vio.frontend.outliers import (
     Consensus,
     MotionPriors,
@@ -17,7 +17,7 @@ from vio.frontend.outliers import (
 )
 from vio.frontend.prediction import prior_rows
 from vio.frontend.right_images import RightImages
-from vio.frontend.scene_motion import MovedPoints, SceneMotion
+from vio.frontend.scene_motion import SceneMotion
 from vio.frontend.tracks import Tracks
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, TrackPrior

@@ -213,6 +213,17 @@ CODES: dict[str, Code] = {
         "a frame shows another view than the one before",
         "add an IMU; keep recordings apart",
     ),
+    "image-geometry-changed": Code(
+        "unusable",
+        "images are scaled, stretched or cropped otherwise than at first",
+        "keep size, crop and zoom of the cameras, or run the parts apart",
+    ),
+    "rig-in-view": Code(
+        "unusable",
+        "parts of the rig that fill the view are taken for the scene, or something moves behind a rig at "
+        "standstill",
+        "mask what moves with the rig (frontend.klt.mask)",
+    ),
     "tracks-disagree": Code(
         "degraded", "tracks fit no common motion", "mask what moves with the rig"
     ),

@@ -18,8 +18,8 @@ from vio.calibration.pair_rotation import PairRotation
 from vio.errors import DataError
 from vio.findings import Finding
 from vio.frontend.descriptors import Keypoints
+from vio.frontend.moving_object import MovedPoints
 from vio.frontend.outliers import Consensus, RansacProblem
-from vio.frontend.scene_motion import MovedPoints
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import project, triangulate
 from vio.guard import exchange, probe, turned_pair, turned_points

@@ -191,6 +191,11 @@ def _zoom(size: float, rng: np.random.Generator) -> Variant:
     return pairs(zoom, 0.01 * size, float(rng.uniform(1.0, 5.0)), *_cameras(rng))
 
 
+def _rescaled(size: float, rng: np.random.Generator) -> Variant:
+    """Both images are scaled at once, as of a stream that negotiates another size."""
+    return pairs(zoom, 0.01 * _sign(rng) * size, 1e-9, 0, 1)
+
+
 def _cut(size: float, rng: np.random.Generator) -> Variant:
     return cut(samples=rng.random() < 0.5)
 
@@ -393,6 +398,7 @@ KINDS: dict[str, Kind] = {
     "part of the rig": Kind("cameras", "always", 0.2, 0.6, "of the height", _mounted),
     "mirror": Kind("cameras", "always", 0.2, 0.6, "of the width", _mirror),
     "zoom": Kind("cameras", "onwards", 0.5, 3.0, "%", _zoom),
+    "rescaled": Kind("cameras", "onwards", 1.0, 10.0, "%", _rescaled),
 }
 # Every second kind is kept aside: the two of a similar pair come to different halves.
 HALVES: dict[str, Half] = {

@@ -14,6 +14,7 @@ import numpy as np
 
 from vio.findings import Finder
 from vio.frontend.frames import usable_prior
+from vio.frontend.moving_object import MovedPoints
 from vio.frontend.outliers import (
     Consensus,
     RansacProblem,
@@ -23,7 +24,7 @@ from vio.frontend.outliers import (
     rigid_consensus,
 )
 from vio.frontend.prediction import prior_pixels
-from vio.frontend.scene_motion import MovedPoints, SceneMotion
+from vio.frontend.scene_motion import SceneMotion
 from vio.frontend.stereo_match import EpipolarRowModel
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate

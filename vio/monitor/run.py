@@ -21,6 +21,7 @@ from vio.imu.settings import DEFAULT_IMU
 from vio.monitor.contradiction import ImuContradiction
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RefusalReport, RunHealth, is_corrected
+from vio.monitor.image_geometry import ImageGeometry
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import IntegrityMonitor, Mark
 from vio.monitor.misfit import TrackMisfit
@@ -68,6 +69,7 @@ class RunMonitor:
         self._health = RunHealth()
         self._refusals = RefusalReport(imu=imu)
         self._views = ViewChange()
+        self._geometry = ImageGeometry(camera)
         self._misfit = TrackMisfit()
         from vio.guard.two_motions import TwoMotions  # loads OpenCV
 
@@ -384,6 +386,7 @@ class RunMonitor:
             if self._contradiction is not None:
                 imu = imu and not self._contradiction.stands
             self._add(self._views.frame(self._seen, ratio, measured=measured, imu=imu))
+            self._add(self._geometry.frame(self._seen, ratio))
             self._add(self._refusals.frame(self._seen, report, estimate))
             misfit = None if measured else report.misfit
             self._add(self._misfit.frame(self._seen, misfit, self._motions.frame(self._seen)))

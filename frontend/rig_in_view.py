@@ -1,0 +1,156 @@
+"""Whether what stays at its pixels, since the first frame or since all else was lost, is a part of the
+rig and not the scene.
+
+An arm, a bonnet or the cabin around a camera may show more features than the scene. Then they win
+the consensus of each frame, the scene's are left out as outliers, and the rig seems to stand still.
+At standstill objects move, too, but those are nearer than the scene behind them, and cover a part of
+the image. What comes onto a window or a lens at once may leave no feature of the scene at all.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from vio.findings import Finder, Finding
+from vio.frontend.moving_object import MovedPoints
+from vio.frontend.outliers import Consensus, RansacProblem, best_motion, pixel_errors
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import depth_of
+from vio.numerics.robust import median
+from vio.records import BoolArray
+
+
+class _RigRules(NamedTuple):
+    """When points that stay at their pixels are of the rig."""
+
+    still_px: float = 0.5  # median, by which they move in a frame at most
+    moved_frames: int = (
+        5  # in which the consensus moves by more, before it is known to be the scene
+    )
+    min_points: int = 12  # of the outliers, that follow another motion
+    min_share: float = 0.05  # of all points
+    rigid_share: float = 0.6  # of the outliers
+    # depth of the points that stay, over that of the others, at most, or …
+    nearer: float = 0.8
+    spread: float = 0.7  # … how far the others lie apart in rows and columns, over those, at least
+    recent_frames: int = 10
+    frames: int = 5  # of them, in which this holds
+    # Points of the last frame that the next one has, over all of them: as usual at least, and at most
+    # where the view is replaced.
+    usual_share: float = 0.5
+    lost_share: float = 0.25
+    min_before: int = 30  # points of the last frame
+
+
+_RIG = _RigRules()
+_CODE = "rig-in-view"
+_STILL = np.eye(4)
+
+
+class RigInView(Finder):
+    """Reports that the consensus may be that of parts of the rig, until it moves."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._since = 0  # frame from which the consensus is watched
+        self._replaced = False  # in that frame, all else was lost, and nothing has moved since
+        self._moved = 0  # frames in which the consensus moves
+        self._recent = deque[bool](maxlen=_RIG.recent_frames)
+        self._reported = False
+        self._last: tuple[int, int, bool] | None = None  # frame, points, and whether as usual
+
+    def replace(self, index: int) -> None:
+        """Take that the scene is gone in a frame that should still show it."""
+        if self._reported:
+            return
+        self._since = index
+        self._replaced = True
+        self._moved = 0
+        self._recent.clear()
+
+    def see(
+        self,
+        index: int,
+        problem: RansacProblem,
+        points: MovedPoints,
+        found: Consensus,
+        measured: FloatArray | None,
+    ) -> None:
+        """Take the consensus over the points of a frame, and the motion (4, 4) that a sensor
+        measures; None: none does.
+        """
+        if self._moved >= _RIG.moved_frames:
+            return
+        flow_px = pixel_errors(problem.camera, _STILL, points.p_prev, points.pixels)
+        stays = found.inliers
+        if not stays.any() or median(flow_px[stays]) > _RIG.still_px:
+            self._moves(index)
+            return
+        scene = ~stays & (flow_px > problem.limit_px)
+        is_rig = self._replaced or _is_scene(problem, points, stays, scene)
+        if is_rig and measured is not None:
+            off_px = pixel_errors(
+                problem.camera, measured, points.p_prev[stays], points.pixels[stays]
+            )
+            is_rig = median(off_px) > problem.limit_px  # else it stands still, by the sensor
+        self._recent.append(is_rig)
+        if not self._reported and sum(self._recent) >= _RIG.frames:
+            self._report(index, float(scene.mean()))
+
+    def is_lost(self, index: int, points: MovedPoints, found: Consensus) -> bool:
+        """Return whether hardly a point of the last frame is in this one, as most were before."""
+        last = self._last
+        count = int(np.count_nonzero(found.inliers))
+        if last is None:
+            self._last = index, count, False
+            return False
+        before, usual_count, usual = last
+        again = int(np.count_nonzero(found.inliers & (points.age >= index - before)))
+        as_usual = again >= _RIG.usual_share * usual_count
+        self._last = index, count, as_usual
+        return usual and usual_count >= _RIG.min_before and again < _RIG.lost_share * usual_count
+
+    def _moves(self, index: int) -> None:
+        self._moved += 1
+        self._replaced = False
+        if self._reported and self._moved >= _RIG.moved_frames:
+            message = (
+                f"frame {index}: the points that stayed at the same pixels are not used any more"
+            )
+            self._found.append(Finding(_CODE, message, index, ended=True))
+
+    def _report(self, index: int, share: float) -> None:
+        self._reported = True
+        what = (
+            f"{100 * share:.0f} % of the points move together, behind or all over others that have "
+            f"stayed at the same pixels since frame {self._since}: parts of the rig or a reflection "
+            "are taken for the scene, or a rig that stands still looks at something that moves"
+        )
+        if self._replaced:
+            what = (
+                f"what was seen before frame {self._since} is gone, and what is seen since stays at "
+                "the same pixels: a pattern on a window or a lens, or a covered camera, is taken for "
+                "the scene"
+            )
+        message = f"frame {index}: {what}"
+        figures = {"scene_share": share}
+        self._found.append(Finding(_CODE, message, index, self._since, lasts=True, figures=figures))
+
+
+def _is_scene(
+    problem: RansacProblem, points: MovedPoints, stays: BoolArray, scene: BoolArray
+) -> bool:
+    """Whether points (N,) that move follow one motion, behind or all over those that stay."""
+    count = int(scene.sum())
+    if count < max(_RIG.min_points, _RIG.min_share * len(scene)):
+        return False
+    depth = depth_of(problem.camera, points.p_prev)
+    if median(depth[stays]) > _RIG.nearer * median(depth[scene]):
+        apart_px = points.pixels[scene].std(axis=0)
+        if (apart_px < _RIG.spread * points.pixels[stays].std(axis=0)).any():
+            return False
+    _, follows = best_motion(problem, points.p_prev[scene], points.pixels[scene], _STILL[None])
+    return int(follows.sum()) >= max(_RIG.min_points, _RIG.rigid_share * count)

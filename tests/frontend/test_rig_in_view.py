@@ -1,0 +1,196 @@
+"""Parts of the rig that show more features than the scene behind them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.frontend.test_frontend_outliers import CAMERA, LIMIT_PX, make_problem, scene
+from vio.findings import Finding
+from vio.frontend.moving_object import MovedPoints
+from vio.frontend.outliers import Consensus, pixel_errors
+from vio.frontend.rig_in_view import RigInView
+from vio.geometry.lie import FloatArray, se3_exp, transform_points
+from vio.geometry.stereo import project
+
+STEP = se3_exp([0.0, 0.0, -0.5, 0.0, 0.02, 0.0])  # T_curr_prev of a rig that moves
+REST = np.eye(4)
+CLOSE = (1.0, 2.0)
+FAR = (4.0, 30.0)
+
+
+def _moved(p: FloatArray, T: FloatArray, seed: int) -> FloatArray:
+    """Pixels (N, 2) of points (N, 3) after a motion, with noise."""
+    rng = np.random.default_rng(seed)
+    uv: FloatArray = project(CAMERA, transform_points(T, p))[:, :2]
+    return uv + rng.normal(0.0, 0.1, uv.shape)
+
+
+def _see(
+    check: RigInView,
+    index: int,
+    stays: FloatArray,
+    moves: FloatArray,
+    motions: tuple[FloatArray, FloatArray] = (REST, STEP),
+    *,
+    measured: FloatArray | None = None,
+    scatter_px: float = 0.0,
+    age: int = 5,
+) -> tuple[Finding, ...]:
+    """What is found in a frame whose consensus is that of the first points (N, 3) and motion."""
+    p = np.concatenate([stays, moves])
+    uv = np.concatenate([_moved(stays, motions[0], index), _moved(moves, motions[1], index)])
+    rng = np.random.default_rng(index)
+    uv[len(stays) :] += rng.uniform(-scatter_px, scatter_px, (len(moves), 2))
+    found = Consensus(motions[0], pixel_errors(CAMERA, motions[0], p, uv) <= LIMIT_PX)
+    ages = np.full(len(p), age)
+    points = MovedPoints(p, uv, ages)
+    if check.is_lost(index, points, found):
+        check.replace(index)
+    else:
+        check.see(index, make_problem(), points, found, measured)
+    return check.take_findings()
+
+
+def _found(
+    frames: int = 12,
+    stay: tuple[float, float] = CLOSE,
+    move: tuple[float, float] = FAR,
+    count: int = 40,
+    motion: FloatArray = STEP,
+    measured: FloatArray | None = None,
+    scatter_px: float = 0.0,
+) -> list[tuple[int | None, bool]]:
+    check = RigInView()
+    found = []
+    for k in range(1, frames):
+        points = scene(200, k, stay), scene(count, 100 + k, move)
+        motions = (REST, motion)
+        found += _see(check, k, *points, motions, measured=measured, scatter_px=scatter_px)
+    return [(f.frame, f.ended) for f in found]
+
+
+def test_a_scene_that_moves_behind_what_stays_is_named_in_the_fifth_frame() -> None:
+    assert _found() == [(5, False)]
+
+
+def _part(p: FloatArray) -> FloatArray:
+    """Those of points (N, 3) that are in the left third of the view, on a third of its rows."""
+    p = p.copy()
+    p[:, :2] = p[:, 2:] * [-0.45, 0.0] + (p[:, :2] - p[:, 2:] * [0.0, 0.0]) / 3.0
+    return p
+
+
+def test_what_moves_in_front_of_a_rig_at_standstill_is_an_object() -> None:
+    check = RigInView()
+    for k in range(1, 20):
+        moves = _part(scene(60, 100 + k, (2.0, 3.0)))
+        assert not _see(check, k, scene(200, k, FAR), moves)
+
+
+def test_what_moves_all_over_what_stays_is_the_scene() -> None:
+    """As behind a window with reflections, whose depth is any."""
+    assert _found(stay=FAR, move=FAR) == [(5, False)]
+    assert _found(stay=FAR, move=CLOSE, motion=se3_exp([0.0, 0.0, -0.1, 0.0, 0.02, 0.0])) == [
+        (5, False)
+    ]
+
+
+def test_a_sensor_that_measures_standstill_is_believed() -> None:
+    assert _found(measured=REST) == []
+    assert _found(measured=STEP) == [(5, False)]
+
+
+@pytest.mark.parametrize(("count", "named"), [(40, True), (13, True), (8, False)])
+def test_few_points_do_not_tell(count: int, named: bool) -> None:
+    assert bool(_found(count=count)) == named
+
+
+def test_points_that_move_each_by_itself_are_no_scene() -> None:
+    """As leaves, or wrong matches."""
+    assert _found(motion=REST, scatter_px=60.0) == []
+
+
+def test_a_rig_at_standstill_that_moves_off_has_none_in_view() -> None:
+    check = RigInView()
+    none = np.zeros((0, 3))
+    for k in range(1, 20):
+        T = REST if k < 8 else STEP
+        assert not _see(check, k, scene(200, k, FAR), none, (T, T))
+    # nor does it later, when it waits beside something that passes behind a fence
+    for k in range(20, 40):
+        assert not _see(check, k, scene(200, k, CLOSE), scene(40, 100 + k, FAR))
+
+
+def test_single_frames_do_not_tell() -> None:
+    check = RigInView()
+    none = np.zeros((0, 3))
+    for k in range(1, 40):
+        moves = none if k % 3 else scene(40, 100 + k, FAR)
+        assert not _see(check, k, scene(200, k, CLOSE), moves)
+
+
+def test_it_ends_once_the_consensus_moves() -> None:
+    check = RigInView()
+    found = []
+    for k in range(1, 20):
+        motions = (REST, STEP) if k < 10 else (STEP, STEP)
+        found += _see(check, k, scene(200, k, CLOSE), scene(40, 100 + k, FAR), motions)
+    assert [(f.code, f.frame, f.since, f.ended) for f in found] == [
+        ("rig-in-view", 5, 0, False),
+        ("rig-in-view", 14, None, True),
+    ]
+
+
+NONE = np.zeros((0, 3))
+
+
+def _replaced(
+    before: FloatArray,
+    after: FloatArray,
+    *,
+    measured: FloatArray | None = None,
+    at: int = 12,
+    kept: bool = False,
+    frames: int = 30,
+) -> list[tuple[str, int | None, int | None, bool]]:
+    """What is found where all points are replaced in a frame, and motions before and after it."""
+    check = RigInView()
+    found = []
+    for k in range(1, frames):
+        T = before if k < at else after
+        age = 5 if k != at or kept else 0
+        found += _see(check, k, scene(200, k, FAR), NONE, (T, T), measured=measured, age=age)
+    return [(f.code, f.frame, f.since, f.ended) for f in found]
+
+
+@pytest.mark.parametrize("before", [REST, STEP])
+def test_what_replaces_the_view_and_stays_at_its_pixels_is_named(before: FloatArray) -> None:
+    assert _replaced(before, REST) == [("rig-in-view", 17, 12, False)]
+
+
+def test_a_rig_that_brakes_or_goes_on_sees_the_scene() -> None:
+    assert _replaced(STEP, REST, kept=True) == []
+    assert _replaced(STEP, STEP) == []
+
+
+def test_a_view_that_is_replaced_moves_before_it_stays() -> None:
+    """As of a rig that was turned fast and then stopped."""
+    check = RigInView()
+    for k in range(1, 30):
+        T = STEP if k <= 13 else REST
+        age = 0 if k == 12 else 5
+        assert not _see(check, k, scene(200, k, FAR), NONE, (T, T), age=age)
+
+
+def test_a_sensor_that_measures_standstill_is_believed_of_a_new_view() -> None:
+    assert _replaced(REST, REST, measured=REST) == []
+    assert _replaced(REST, REST, measured=STEP) == [("rig-in-view", 17, 12, False)]
+
+
+def test_points_that_never_last_tell_of_no_new_view() -> None:
+    """As in rain, or of a front end that finds them anew."""
+    check = RigInView()
+    for k in range(1, 30):
+        age = 0 if k % 3 else 5
+        assert not _see(check, k, scene(200, k, FAR), NONE, (REST, REST), age=age)
