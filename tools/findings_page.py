@@ -18,12 +18,12 @@ version to version: compare codes, not sentences. `metrics.json` lists them unde
 
 **Integrity.** `Estimate.integrity` says whether the assumptions behind a covariance hold: *nominal*, *degraded* (a
 sensor or a part of the images is left out; the covariance still covers the error), *unusable* (an assumption does not
-hold; the covariance also covers that the rig has moved in any direction since then, at the fastest speed so far). The
-column `integrity` of `frames.csv` is 0, 1, 2; in `trajectory.png` the time of degraded estimates is yellow, that of
-unusable ones red. Where a fault began before it was found, earlier frames are marked in the files.
+hold; the covariance also covers that the rig has moved in any direction since then, at the fastest speed so far). In
+`frames.csv` these are 0, 1, 2; `trajectory.png` shows degraded estimates in yellow, unusable ones in red. In files,
+frames are marked from where the fault began.
 
 `vio.protection_level(estimate)` gives the radius in the horizontal plane and the half height that contain the true
-position with a probability (0.997 unless given), as receivers of satellite navigation state it.
+position with a probability (0.997 unless given).
 
 This page is written by `python -m tools.findings_page`.
 

@@ -91,14 +91,14 @@ def worst(effects: list[Integrity]) -> Integrity:
     return max(effects, key=INTEGRITIES.index, default="nominal")
 
 
-_EXPOSURES = "pair images by their times of exposure, or synchronise the cameras"
+_EXPOSURES = "pair images by exposure times, or synchronise the cameras"
 _CAMERA = "check camera, cable and driver"
 
 CODES: dict[str, Code] = {
     "bands": Code(
         "nominal",
         "bands of brightness move through the images; they are taken out",
-        "use a light that does not flicker, or an exposure of whole periods of the mains",
+        "use steady light",
     ),
     "projected-dots": Code(
         "degraded",
@@ -112,7 +112,7 @@ CODES: dict[str, Code] = {
     ),
     "readout-contradicted": Code(
         "unusable",
-        "how features move shows another readout time of the shutter than is stated",
+        "features move as by another readout time than is stated",
         "correct frontend.readout_ms, or leave it out",
     ),
     "shutter-put-right": Code(
@@ -215,14 +215,13 @@ CODES: dict[str, Code] = {
     ),
     "image-geometry-changed": Code(
         "unusable",
-        "images are scaled, stretched or cropped otherwise than at first",
-        "keep size, crop and zoom of the cameras, or run the parts apart",
+        "images are scaled or cropped otherwise than at first",
+        "keep size, crop and zoom",
     ),
     "rig-in-view": Code(
         "unusable",
-        "parts of the rig that fill the view are taken for the scene, or something moves behind a rig at "
-        "standstill",
-        "mask what moves with the rig (frontend.klt.mask)",
+        "parts of the rig are taken for the scene, or something moves behind a rig at standstill",
+        "mask the rig (frontend.klt.mask)",
     ),
     "tracks-disagree": Code(
         "degraded", "tracks fit no common motion", "mask what moves with the rig"
