@@ -139,7 +139,7 @@ class ReadoutTime(Finder):
         if shown is None:
             return
         often, seldom = _RULES.often
-        near = self._passes or self._looked < often
+        near = self._looked < often or (self._passes and not self._stated_s)
         self._waits = 2 if near else 5 if self._looked < seldom else 10
         self._looked += 1
         self._add(shown)
@@ -251,6 +251,8 @@ class ReadoutTime(Finder):
 
     def _test(self, index: int, found_s: float, sigma_s: float) -> None:
         """Tell a stated readout time that is another one's, or that it is right."""
+        if sigma_s > max(_RULES.sigma_s, _RULES.usual * abs(found_s)):
+            return  # nothing to linearise at
         if not self._is_precise(found_s, sigma_s):
             return
         self._open = False

@@ -33,9 +33,10 @@ class _RigRules(NamedTuple):
     min_points: int = 12  # of the outliers, that follow another motion
     min_share: float = 0.05  # of all points
     rigid_share: float = 0.6  # of the outliers
-    # depth of the points that stay, over that of the others, at most, or …
+    # how far the others lie apart, over those that stay, at least: in rows and columns, or …
+    spread: float = 0.7
+    # … in one of them, where the depth of the points that stay, over that of the others, is at most
     nearer: float = 0.8
-    spread: float = 0.7  # … how far the others lie apart in rows and columns, over those, at least
     recent_frames: int = 10
     frames: int = 5  # of them, in which this holds
     # Points of the last frame that the next one has, over all of them: as usual at least, and at most
@@ -55,7 +56,8 @@ class RigInView(Finder):
 
     def __init__(self) -> None:
         super().__init__()
-        self._since = 0  # frame from which the consensus is watched
+        self._since: int | None = None  # frame from which the consensus is watched
+        self._stays = True  # the last one did
         self._replaced = False  # in that frame, all else was lost, and nothing has moved since
         self._moved = 0  # frames in which the consensus moves
         self._recent = deque[bool](maxlen=_RIG.recent_frames)
@@ -63,8 +65,12 @@ class RigInView(Finder):
         self._last: tuple[int, int, bool] | None = None  # frame, points, and whether as usual
 
     def replace(self, index: int) -> None:
-        """Take that the scene is gone in a frame that should still show it."""
-        if self._reported:
+        """Take that the scene is gone in a frame that should still show it.
+
+        Beside a rig that moved, whose next view moves, too; beside one at rest, a light may have been
+        switched on.
+        """
+        if self._reported or self._stays:
             return
         self._since = index
         self._replaced = True
@@ -82,11 +88,16 @@ class RigInView(Finder):
         """Take the consensus over the points of a frame, and the motion (4, 4) that a sensor
         measures; None: none does.
         """
-        if self._moved >= _RIG.moved_frames:
+        if self._since is None:
+            self._since = index
+        stays = found.inliers
+        if not stays.any():
             return
         flow_px = pixel_errors(problem.camera, _STILL, points.p_prev, points.pixels)
-        stays = found.inliers
-        if not stays.any() or median(flow_px[stays]) > _RIG.still_px:
+        self._stays = median(flow_px[stays]) <= _RIG.still_px
+        if self._moved >= _RIG.moved_frames:
+            return
+        if not self._stays:
             self._moves(index)
             return
         scene = ~stays & (flow_px > problem.limit_px)
@@ -143,14 +154,17 @@ class RigInView(Finder):
 def _is_scene(
     problem: RansacProblem, points: MovedPoints, stays: BoolArray, scene: BoolArray
 ) -> bool:
-    """Whether points (N,) that move follow one motion, behind or all over those that stay."""
+    """Whether points (N,) that move follow one motion, behind those that stay and as wide or high,
+    or all over them.
+    """
     count = int(scene.sum())
     if count < max(_RIG.min_points, _RIG.min_share * len(scene)):
         return False
     depth = depth_of(problem.camera, points.p_prev)
-    if median(depth[stays]) > _RIG.nearer * median(depth[scene]):
-        apart_px = points.pixels[scene].std(axis=0)
-        if (apart_px < _RIG.spread * points.pixels[stays].std(axis=0)).any():
-            return False
+    is_behind = median(depth[stays]) <= _RIG.nearer * median(depth[scene])
+    apart_px = points.pixels[scene].std(axis=0)
+    is_wide = apart_px >= _RIG.spread * points.pixels[stays].std(axis=0)
+    if not (is_wide.any() if is_behind else is_wide.all()):
+        return False
     _, follows = best_motion(problem, points.p_prev[scene], points.pixels[scene], _STILL[None])
     return int(follows.sum()) >= max(_RIG.min_points, _RIG.rigid_share * count)

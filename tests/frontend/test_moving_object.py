@@ -619,6 +619,7 @@ class _Run:
 
 STILL = np.eye(4)
 SLOW = se3_exp([0.002, 0.0, -0.001, 0.0, 0.0002, 0.0])
+MOVING = se3_exp([0.02, 0.0, -0.01, 0.0, 0.002, 0.0])
 
 
 def test_what_replaces_all_points_of_the_scene_at_once_is_doubted_while_it_stays() -> None:
@@ -626,21 +627,21 @@ def test_what_replaces_all_points_of_the_scene_at_once_is_doubted_while_it_stays
     run.frames(8, SLOW)
     run.lose(0, skipped=3)
     run.frames(60, STILL)
-    assert run.said == ["object-or-scene", "rig-in-view"]
+    assert run.said == ["object-or-scene"]
 
 
 def test_points_of_the_scene_that_are_left_prove_its_motion() -> None:
-    moving = se3_exp([0.02, 0.0, -0.01, 0.0, 0.002, 0.0])
-    run = _Run()
-    run.frames(8, moving)
-    run.lose(5)
-    run.frames(60, moving)
-    assert run.said == []
+    for motion in (SLOW, MOVING):
+        run = _Run()
+        run.frames(8, motion)
+        run.lose(5)
+        run.frames(60, motion)
+        assert run.said == []
 
 
 def test_what_replaces_nearly_all_points_and_stays_at_its_pixels_is_of_the_rig() -> None:
     run = _Run()
-    run.frames(8, SLOW)
+    run.frames(8, MOVING)
     run.lose(5)
     run.frames(60, STILL)
     assert run.said == ["rig-in-view"]
@@ -659,9 +660,9 @@ def test_what_was_doubted_is_the_scene_once_all_of_it_has_passed() -> None:
     run.frames(8, SLOW)
     run.lose(0)
     run.frames(10, STILL)
-    assert run.said == ["object-or-scene", "rig-in-view"]
+    assert run.said == ["object-or-scene"]
     run.frames(60, se3_exp([0.0, 0.0, -1.0, 0.0, 0.0, 0.0]))
-    assert run.said[2:] == ["-rig-in-view", "-object-or-scene"]
+    assert run.said == ["object-or-scene", "-object-or-scene"]
 
 
 def test_an_object_that_has_hidden_the_scene_is_doubted_when_it_stops() -> None:

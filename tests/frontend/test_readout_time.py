@@ -118,6 +118,17 @@ def test_a_steady_velocity_shows_nothing() -> None:
         assert not _search(frames, 0.02).take_findings()
 
 
+@pytest.mark.parametrize("stated_s", [0.0, 0.02])
+def test_what_never_shows_is_looked_for_seldom(stated_s: float) -> None:
+    search = ReadoutTime(replace(_CAMERA, readout_s=stated_s), RowShares(_CAMERA, None))
+    slow = lambda t: 0.3 * _steady(t)  # noqa: E731 - in view for longer
+    looked = []
+    for k in range(260):
+        search.frame(_seen(k, slow, stated_s))
+        looked.append(search._looked)
+    assert looked[-1] - looked[-101] == 10
+
+
 def test_what_else_moves_pixels_is_no_readout_time() -> None:
     rng = np.random.default_rng(1)
     jitter = [_seen(k, _shaken, 0.0, late_s=rng.uniform(-5e-3, 5e-3)) for k in range(160)]

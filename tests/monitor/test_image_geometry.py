@@ -84,6 +84,33 @@ def test_images_that_are_as_before_again_end_it(change: tuple[float, ...]) -> No
     assert [(f.frame, f.ended) for f in found] == [(3, False), (6, True)]
 
 
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_of_one_frame_ends_in_the_next(change: tuple[float, ...]) -> None:
+    """Which is found also where the filter has left its features out."""
+    frames = [_frame(k, SCENE, change if k == 4 else NONE) for k in range(9)]
+    check = ImageGeometry(CAMERA)
+    found = [f for k, seen in enumerate(frames) for f in check.frame(seen, 3.0 if k < 5 else 1.0)]
+    assert [(f.frame, f.ended) for f in found] == [(4, False), (5, True)]
+
+
+def test_a_zoom_of_several_frames_has_not_ended_before_it_is_back() -> None:
+    there = [1.0, 1.0, 1.0, 1.02, 1.04, 1.06]
+    factors = [*there, 1.06, 1.06, *reversed(there)]
+    found = _found([_frame(k, SCENE, (s, s, 0.0, 0.0)) for k, s in enumerate(factors)])
+    assert [(f.frame, f.ended) for f in found] == [(3, False), (11, True)]
+
+
+@pytest.mark.parametrize(("factor", "named"), [(0.9, True), (0.975, False)])
+def test_a_large_change_is_known_well_enough_where_pixels_are_bad(
+    factor: float, named: bool
+) -> None:
+    frames = [
+        _frame(k, SCENE[:60], (factor, factor, 0.0, 0.0) if k >= 4 else NONE, sigma_px=0.7)
+        for k in range(8)
+    ]
+    assert bool(_found(frames)) == named
+
+
 def test_a_second_change_is_the_same_event() -> None:
     factors = (1.0, 1.0, 0.97, 0.97, 0.9, 0.9)
     frames = [_frame(k, SCENE, (s, s, 0.0, 0.0)) for k, s in enumerate(factors)]

@@ -47,7 +47,7 @@ def _rows_fit(rows_px: float = 0.0, positive: float = 1.0) -> bool:
         rms_px=rows_px,
         disparity_px=10.0,
     )
-    return not _rows_faults(found)
+    return not _rows_faults(found, alike=False)
 
 
 def _distinct(ratio: float) -> bool:

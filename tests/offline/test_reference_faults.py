@@ -311,6 +311,17 @@ def test_placeholders_before_a_body_is_found_are_named(name: str) -> None:
     assert not [note for note in evaluate(*given).notes if "clock" in note]
 
 
+def test_a_gap_of_a_recording_after_its_start_leaves_no_placeholders() -> None:
+    whole = _trajectory()
+    assert whole.times_ns is not None
+    for standing in (1, 20):
+        kept = np.r_[0:standing, 100 : len(whole)]
+        poses = whole.T_world_body[kept].copy()
+        poses[:standing] = poses[0]
+        gap = replace(whole, T_world_body=poses, times_ns=whole.times_ns[kept])
+        assert not [n for n in evaluate(gap, gap).notes if "placeholders" in n]
+
+
 def test_a_body_that_stands_at_its_start_has_no_placeholders() -> None:
     whole = _trajectory()
     poses = whole.T_world_body.copy()

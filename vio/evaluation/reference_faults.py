@@ -217,7 +217,11 @@ def _placeholders(trajectory: Trajectory, name: str) -> str | None:
     begun = int(moved[0])
     steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
     jump_m = float(steps[begun - 1])
-    if jump_m > max(_FAULT.min_jump_m, _FAULT.begun * float(steps[begun:].max(initial=0.0))):
+    if trajectory.times_ns is not None:  # the step over a gap of a recording is no jump
+        steps = steps / np.diff(trajectory.times_ns)
+    usual = float(steps[begun:].max(initial=0.0))
+    jumps = jump_m > _FAULT.min_jump_m and steps[begun - 1] > _FAULT.begun * usual
+    if begun > 1 and jumps:
         return (
             f"the first {begun} poses of the {name} are the same to the bit, {jump_m:.3g} m from the "
             "next one: placeholders from before the body was found; remove these rows"

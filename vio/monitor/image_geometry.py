@@ -19,7 +19,7 @@ from vio.geometry.lie import FloatArray, circledot, length, se3_exp, transform_p
 from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
 from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import median
-from vio.records import Observations, shared_rows
+from vio.records import BoolArray, Observations, shared_rows
 
 
 class _GeometryRules(NamedTuple):
@@ -36,9 +36,11 @@ class _GeometryRules(NamedTuple):
     # recordings and their variants gives growths up to .006 at 3, .002 at 10, and shifts up to 2 px
     # at 20, 7 px at 5.
     sigmas: float = 8.0
-    # Times the least change, as which these are at most: else a part of it is not known. A fit of 63
-    # features of KITTI with their outliers gives a growth of .05 at 15, known to 3.
+    # Times the least change, or times the change, as which these are at most: else a part of it is
+    # not known. A fit of 63 features of KITTI with their outliers gives a growth of .05 at 15, known
+    # to 3.
     most_uncertain: float = 2.0
+    share_uncertain: float = 0.3
     min_growth: float = 0.005
     min_shift_px: float = 3.0
     # how far all disparities may be off: by as much, times the way over the baseline, so may pixels
@@ -56,12 +58,27 @@ class _Change:
     """By how much pixels of a frame are off those that the motion explains."""
 
     value: FloatArray  # (4,) growth of columns and rows about the principal point, their shifts, px
-    limit: FloatArray  # (4,) up to which it counts as none; infinite: it is not known well enough
+    least: FloatArray  # (4,) up to which it counts as none, however well it is known
+    limit: FloatArray  # (4,) likewise, as it is known
+
+    @property
+    def known(self) -> BoolArray:
+        """Which parts (4,) of it are known well enough."""
+        most = np.maximum(
+            _RULES.most_uncertain * self.least, _RULES.share_uncertain * np.abs(self.value)
+        )
+        return self.limit <= most
 
     @property
     def is_clear(self) -> bool:
-        """Whether a part of it is beyond its limit."""
-        return bool((np.abs(self.value) > self.limit).any())
+        """Whether a part of it is known, and beyond its limit."""
+        return bool((self.known & (np.abs(self.value) > self.limit)).any())
+
+    def beyond(self, size: FloatArray, limit: FloatArray) -> _Change:
+        """What is known of it beyond sizes (4,) either way, by the larger one of two limits."""
+        left = np.copysign(np.maximum(np.abs(self.value) - size, 0.0), self.value)
+        change = _Change(left, self.least, np.maximum(self.limit, limit))
+        return _Change(np.where(change.known, left, 0.0), change.least, change.limit)
 
 
 class ImageGeometry:
@@ -75,6 +92,8 @@ class ImageGeometry:
         # (4,) factors of columns and rows, and shifts in px, since the first frame
         self._since_first = _NONE.copy()
         self._changed = False  # as reported
+        # (4,) what the frame before was found to differ by: not what pairs usually differ by
+        self._counted = np.zeros(4)
 
     def frame(self, seen: Observations, innovation_ratio: float | None) -> list[Finding]:
         """Return what a frame shows, whose innovation over its standard deviation is given; None:
@@ -82,10 +101,13 @@ class ImageGeometry:
         """
         frames = self._frames
         frames.append(seen)
+        counted = self._counted
+        self._counted = np.zeros(4)
         if len(frames) < 3 or not self._has_depth:
             return []
         is_off = innovation_ratio is not None and innovation_ratio >= _RULES.min_sigmas
-        if not is_off and len(seen) > _RULES.left_share * len(frames[1]):
+        is_looked_at = is_off or self._changed
+        if not is_looked_at and len(seen) > _RULES.left_share * len(frames[1]):
             return []
         change = _between(self._camera, frames[1], seen)
         if change is None or not change.is_clear:
@@ -93,9 +115,10 @@ class ImageGeometry:
         usual = _between(self._camera, frames[0], frames[1])
         if usual is None:
             return []
-        change = _Change(change.value - usual.value, np.maximum(change.limit, usual.limit))
+        change = change.beyond(np.abs(usual.value - counted), usual.limit)
         if not change.is_clear:
             return []
+        self._counted = change.value
         factors = 1.0 + change.value[:2]
         self._since_first[:2] *= factors
         self._since_first[2:] = factors * self._since_first[2:] + change.value[2:]
@@ -170,9 +193,7 @@ def _fitted(camera: StereoCamera, p: FloatArray, z: FloatArray) -> _Change | Non
             _RULES.min_shift_px + off_px,
         ]
     )
-    uncertain = _RULES.sigmas * np.sqrt(of_change)
-    known = uncertain <= _RULES.most_uncertain * least
-    return _Change(value, np.where(known, np.maximum(least, uncertain), np.inf))
+    return _Change(value, least, np.maximum(least, _RULES.sigmas * np.sqrt(of_change)))
 
 
 def _changed(index: int, since_first: FloatArray) -> Finding:
