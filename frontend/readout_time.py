@@ -47,9 +47,8 @@ class _ReadoutRules(NamedTuple):
     least_s: float = 2e-3  # shorter readout times count as none, and smaller differences from one
     # share by which a stated one may be off, which is three times what one that is found is off
     stated: float = 0.3
-    sigma_s: float = (
-        0.5e-3  # as precise as that, it is known, and a shorter one is none from then on
-    )
+    # as precise as that, it is known, and a shorter one is none from then on
+    sigma_s: float = 0.5e-3
     # after so many looks at every other frame, and at every fifth, every tenth is enough
     often: tuple[int, int] = (20, 40)
 
@@ -227,13 +226,12 @@ class ReadoutTime(Finder):
             return
         self.readout_s = found_s
         self._open = False
-        sigma_s = math.hypot(sigma_s, _RULES.usual * found_s)
-        figures = {"readout_ms": 1e3 * found_s, "sigma_ms": 1e3 * sigma_s}
+        figures = _figures(found_s, sigma_s)
         first = "first" if found_s > 0.0 else "last"
         message = (
             f"frame {seen.frame_index}: the shutter rolls, by how features move where the velocity "
             f"changes: rows are exposed one after the other, from the {first} one on, within "
-            f"{1e3 * abs(found_s):.1f} +/- {1e3 * sigma_s:.1f} ms; features are moved to the time of "
+            f"{1e3 * abs(found_s):.1f} +/- {figures['sigma_ms']:.1f} ms; features are moved to the time of "
             f"the middle row from here on; set frontend.readout_ms to {1e3 * found_s:.1f}"
         )
         self._found.append(
@@ -261,15 +259,22 @@ class ReadoutTime(Finder):
         limit_s = max(_RULES.least_s, _RULES.certain * sigma_s, _RULES.stated * longer_s)
         if abs(found_s - stated_s) <= limit_s:
             return
-        sigma_s = math.hypot(sigma_s, _RULES.usual * found_s)
-        figures = {"readout_ms": 1e3 * found_s, "sigma_ms": 1e3 * sigma_s}
+        figures = _figures(found_s, sigma_s)
         message = (
             f"frame {index}: the stated readout time of {1e3 * stated_s:.1f} ms does not fit how "
             f"features move where the velocity changes, which shows {1e3 * found_s:.1f} +/- "
-            f"{1e3 * sigma_s:.1f} ms (0: a global shutter); correct frontend.readout_ms, or the "
+            f"{figures['sigma_ms']:.1f} ms (0: a global shutter); correct frontend.readout_ms, or the "
             "calibration that states it"
         )
         self._found.append(Finding("readout-contradicted", message, index, 0, figures=figures))
+
+
+def _figures(found_s: float, sigma_s: float) -> dict[str, float]:
+    """A readout time and its standard deviation, with what is usual on real rigs."""
+    return {
+        "readout_ms": 1e3 * found_s,
+        "sigma_ms": 1e3 * math.hypot(sigma_s, _RULES.usual * found_s),
+    }
 
 
 def moved_by(p: FloatArray, twists: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ from vio.findings import Finder, Finding
 from vio.frontend.moving_object import MovedPoints
 from vio.frontend.outliers import Consensus, RansacProblem, best_motion, pixel_errors
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import depth_of
+from vio.geometry.stereo import StereoCamera, depth_of
 from vio.numerics.robust import median
 from vio.records import BoolArray
 
@@ -27,9 +27,8 @@ class _RigRules(NamedTuple):
     """When points that stay at their pixels are of the rig."""
 
     still_px: float = 0.5  # median, by which they move in a frame at most
-    moved_frames: int = (
-        5  # in which the consensus moves by more, before it is known to be the scene
-    )
+    # in which the consensus moves by more, before it is known to be the scene
+    moved_frames: int = 5
     min_points: int = 12  # of the outliers, that follow another motion
     min_share: float = 0.05  # of all points
     rigid_share: float = 0.6  # of the outliers
@@ -57,20 +56,23 @@ class RigInView(Finder):
     def __init__(self) -> None:
         super().__init__()
         self._since: int | None = None  # frame from which the consensus is watched
-        self._stays = True  # the last one did
+        # the last frame's points, and which (N,) are of its consensus
+        self._seen: tuple[MovedPoints, BoolArray] | None = None
         self._replaced = False  # in that frame, all else was lost, and nothing has moved since
         self._moved = 0  # frames in which the consensus moves
         self._recent = deque[bool](maxlen=_RIG.recent_frames)
         self._reported = False
         self._last: tuple[int, int, bool] | None = None  # frame, points, and whether as usual
 
-    def replace(self, index: int) -> None:
+    def replace(self, index: int, camera: StereoCamera) -> None:
         """Take that the scene is gone in a frame that should still show it.
 
         Beside a rig that moved, whose next view moves, too; beside one at rest, a light may have been
         switched on.
         """
-        if self._reported or self._stays:
+        if self._reported or self._seen is None:
+            return
+        if _flow_px(camera, *self._seen) <= _RIG.still_px:
             return
         self._since = index
         self._replaced = True
@@ -93,13 +95,13 @@ class RigInView(Finder):
         stays = found.inliers
         if not stays.any():
             return
-        flow_px = pixel_errors(problem.camera, _STILL, points.p_prev, points.pixels)
-        self._stays = median(flow_px[stays]) <= _RIG.still_px
+        self._seen = points, stays
         if self._moved >= _RIG.moved_frames:
             return
-        if not self._stays:
+        if _flow_px(problem.camera, points, stays) > _RIG.still_px:
             self._moves(index)
             return
+        flow_px = pixel_errors(problem.camera, _STILL, points.p_prev, points.pixels)
         scene = ~stays & (flow_px > problem.limit_px)
         is_rig = self._replaced or _is_scene(problem, points, stays, scene)
         if is_rig and measured is not None:
@@ -149,6 +151,11 @@ class RigInView(Finder):
         message = f"frame {index}: {what}"
         figures = {"scene_share": share}
         self._found.append(Finding(_CODE, message, index, self._since, lasts=True, figures=figures))
+
+
+def _flow_px(camera: StereoCamera, points: MovedPoints, chosen: BoolArray) -> float:
+    """Median way of chosen points (N,) through the image since the frame before."""
+    return median(pixel_errors(camera, _STILL, points.p_prev[chosen], points.pixels[chosen]))
 
 
 def _is_scene(

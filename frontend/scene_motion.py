@@ -141,7 +141,7 @@ class SceneMotion:
         by_sensor = None if measured is None else measured.T_curr_prev
         is_lost = self._rig.is_lost(index, points, found)
         if is_lost and (self._scene is None or self._scene.is_in_view(problem.camera, index)):
-            self._rig.replace(index)
+            self._rig.replace(index, problem.camera)
         else:
             self._rig.see(index, problem, points, found, by_sensor)
         voting = voters(points.age)

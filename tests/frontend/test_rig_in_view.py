@@ -47,7 +47,7 @@ def _see(
     ages = np.full(len(p), age)
     points = MovedPoints(p, uv, ages)
     if check.is_lost(index, points, found):
-        check.replace(index)
+        check.replace(index, CAMERA)
     else:
         check.see(index, make_problem(), points, found, measured)
     return check.take_findings()

@@ -50,7 +50,6 @@ class _SizeRules(NamedTuple):
 
 _SIZE = _SizeRules()
 EARTH_GRAVITY_MPS2 = 9.80665
-_GRAVITY = EARTH_GRAVITY_MPS2
 _MILLI_G = 1000.0
 
 
@@ -269,11 +268,11 @@ def _judge_setting(usual: float, spread: float, gravity_mps2: float) -> Size | N
     """Judge a median magnitude by gravity that is set to another than the Earth's; None: it is not, or
     the magnitude is neither.
     """
-    if abs(gravity_mps2 / _GRAVITY - 1.0) < _SIZE.as_gravity or not spread < _SIZE.steady:
+    if abs(gravity_mps2 / EARTH_GRAVITY_MPS2 - 1.0) < _SIZE.as_gravity or not spread < _SIZE.steady:
         return None
     if abs(usual / gravity_mps2 - 1.0) < _SIZE.as_gravity and gravity_mps2 > _SIZE.least_set_mps2:
         return Size(None, 1.0)
-    if abs(usual / _GRAVITY - 1.0) > _SIZE.as_gravity:
+    if abs(usual / EARTH_GRAVITY_MPS2 - 1.0) > _SIZE.as_gravity:
         return None
     finding = InertialFinding(
         "accelerometer units",
@@ -292,8 +291,8 @@ def judge_exchange(times_ns: IntArray, values: FloatArray) -> InertialFinding | 
         return None
     accel, accel_spread = _usual_size(times_ns, values[:, 3:])
     gyro, gyro_spread = _usual_size(times_ns, values[:, :3])
-    steady = abs(gyro / _GRAVITY - 1.0) < _SIZE.as_gravity and gyro_spread < _SIZE.steady
-    if not steady or accel > _SIZE.no_gravity * _GRAVITY:
+    steady = abs(gyro / EARTH_GRAVITY_MPS2 - 1.0) < _SIZE.as_gravity and gyro_spread < _SIZE.steady
+    if not steady or accel > _SIZE.no_gravity * EARTH_GRAVITY_MPS2:
         return None
     return InertialFinding(
         "gravity removed",
@@ -321,7 +320,7 @@ def _usual_size(times_ns: IntArray, accel: FloatArray) -> tuple[float, float]:
 
 def _judge_median(usual: float, spread: float, step_s: float) -> Size:
     """Judge a median magnitude and its relative spread, of samples an interval apart."""
-    if 0.5 < usual / _GRAVITY < 2.5:
+    if 0.5 < usual / EARTH_GRAVITY_MPS2 < 2.5:
         return Size(None, 1.0)
     seen = (
         f"the accelerometer's median magnitude is {usual:.4g} where gravity alone gives 9.8 m/s^2"
@@ -329,14 +328,14 @@ def _judge_median(usual: float, spread: float, step_s: float) -> Size:
     named = _named_unit(usual, spread, seen) or _increments(usual, spread, seen, step_s)
     if named is not None:
         return named
-    if usual < 0.5 * _GRAVITY and (spread >= 0.3 or usual < 0.5):
+    if usual < 0.5 * EARTH_GRAVITY_MPS2 and (spread >= 0.3 or usual < 0.5):
         return Size(gravity_removed(f"{seen}, and it varies by {100 * spread:.0f} %"), None)
     finding = InertialFinding(
         "accelerometer units",
         f"{seen} (spread {100 * spread:.0f} %)",
-        f"the unit or scale is unknown; a factor of {_GRAVITY / usual:.4g} would make it 9.8",
+        f"the unit or scale is unknown; a factor of {EARTH_GRAVITY_MPS2 / usual:.4g} would make it 9.8",
     )
-    return Size(finding, _GRAVITY / usual, usual > 0.5 * _GRAVITY)
+    return Size(finding, EARTH_GRAVITY_MPS2 / usual, usual > 0.5 * EARTH_GRAVITY_MPS2)
 
 
 def _named_unit(usual: float, spread: float, seen: str) -> Size | None:
@@ -350,12 +349,14 @@ def _named_unit(usual: float, spread: float, seen: str) -> Size | None:
     }
     for gravity, explanation in units.items():
         if 0.6 < usual / gravity < 1.6:
-            factor = None if gravity == _MILLI_G else _GRAVITY / gravity  # of which there are two
+            factor = (
+                None if gravity == _MILLI_G else EARTH_GRAVITY_MPS2 / gravity
+            )  # of which there are two
             finding = InertialFinding(
                 "accelerometer units", seen, f"the readings are {explanation}", factor=factor
             )
             clear = gravity > 1.0 or (abs(usual - 1.0) < 0.1 and spread < 0.06)
-            return Size(finding, _GRAVITY / gravity, clear)
+            return Size(finding, EARTH_GRAVITY_MPS2 / gravity, clear)
     return None
 
 
@@ -363,7 +364,7 @@ def _increments(usual: float, spread: float, seen: str, step_s: float) -> Size |
     """Return the judgement of a steady magnitude that is gravity times the interval between samples;
     None: it is not.
     """
-    excess = abs(usual / (_GRAVITY * step_s) - 1.0)
+    excess = abs(usual / (EARTH_GRAVITY_MPS2 * step_s) - 1.0)
     if not (spread < _SIZE.steady and excess < _SIZE.as_gravity):
         return None
     finding = InertialFinding(
