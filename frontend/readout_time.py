@@ -22,6 +22,7 @@ from vio.geometry.lie import FloatArray, circledot
 from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
 from vio.numerics.compiled import move_poses
 from vio.numerics.kinds import Tolerance
+from vio.numerics.robust import NormalEquations, cauchy_equations
 from vio.records import NS_PER_S, IntArray, Observations, shared_rows
 
 
@@ -201,7 +202,7 @@ class ReadoutTime(Finder):
         if not information > 0.0:
             return
         readout_s = near_s + (gradient[size] - normal[size, :size] @ solved[:, 0]) / information
-        weight = information / variance
+        weight = information / max(variance, _RULES.least_px**2)
         self._sums += [1.0, weight, weight * readout_s, weight * readout_s**2]
 
     def _decide(self, seen: Observations) -> None:
@@ -287,9 +288,9 @@ def moved_by(p: FloatArray, twists: FloatArray) -> FloatArray:
 
 def _equations(
     camera: StereoCamera, shown: _Shown, motion: FloatArray, readout_s: float
-) -> tuple[FloatArray, FloatArray, float]:
-    """Normal equations of the points' velocity and its derivatives (M, 6) and of the readout time,
-    (6 M + 1, 6 M + 1) and (6 M + 1,), with Cauchy's weights, and the variance of a pixel, px^2.
+) -> NormalEquations:
+    """Equations of the points' velocity and its derivatives (M, 6), and of the readout time, the
+    last parameter; a feature counts in all frames or in none.
     """
     from_s = readout_s * shown.share
     to_s = shown.time_s + readout_s * shown.there
@@ -306,13 +307,12 @@ def _equations(
     earlier = from_s[:, None] ** (orders - 1) * shown.share[:, None]
     slope = ((later - earlier) * orders / factorials)[:, 1:] @ motion[1:]
     J[:, :, -1] = (by_twist @ slope[:, :, None])[:, :, 0]
-    squared = (r * r).sum(axis=1).reshape(shown.others, -1).sum(axis=0)
-    pixels = 3.0 * shown.others  # of a feature, which counts in all frames or in none
-    weight = 1.0 / (1.0 + squared / max(float(np.median(squared)), pixels * _RULES.least_px**2))
-    weighted = (J * np.tile(weight, shown.others)[:, None, None]).reshape(len(r) * 3, -1)
-    variance = float((weight * squared).sum() / (pixels * weight.sum()))
-    return (
-        weighted.T @ J.reshape(len(r) * 3, -1),
-        weighted.T @ r.reshape(-1),
-        max(variance, _RULES.least_px**2),
+    return cauchy_equations(
+        _by_feature(r, shown.others), _by_feature(J, shown.others), _RULES.least_px
     )
+
+
+def _by_feature(rows: FloatArray, others: int) -> FloatArray:
+    """Rows (M N, 3, ...) of M frames, one after the other, as (N, 3 M, ...)."""
+    of_frames = rows.reshape(others, -1, *rows.shape[1:])
+    return of_frames.swapaxes(0, 1).reshape(of_frames.shape[1], -1, *rows.shape[2:])

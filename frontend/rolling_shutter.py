@@ -21,6 +21,7 @@ from vio.findings import Finding
 from vio.frontend.readout_time import MIN_DEPTH_M, ReadoutTime, RowShares, moved_by
 from vio.geometry.lie import FloatArray, circledot
 from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
+from vio.numerics.robust import cauchy_equations
 from vio.records import NS_PER_S, Observations, shared_rows
 
 
@@ -29,7 +30,7 @@ class _ShutterRules(NamedTuple):
 
     min_features: int = 12  # that two frames share, with depth
     steps: int = 5  # of Gauss-Newton
-    least_px: float = 0.1  # scale of the residuals beyond which they count less, at least
+    least_px: float = 0.06  # width of the pixels' weights, at least
     least_elapsed: float = 0.1  # of the time between frames, between the rows of a wrong match
     held_s: float = 0.25  # for so long a velocity is taken to go on
     # of the rows, those about the middle one, in which features are used as they are seen where
@@ -181,11 +182,7 @@ def _fitted(
             p, z, between_s, there = p[ahead], z[ahead], between_s[ahead], there[ahead]
         r = z - project(camera, there)[:, :3]
         J = -between_s[:, None, None] * (z_D_p_cam(camera, there)[:, :3] @ circledot(there)[:, :3])
-        squared = (r * r).sum(axis=1)
-        scale = max(float(np.median(squared)), _RULES.least_px**2)
-        weight = 1.0 / (1.0 + squared / scale)
-        A = np.einsum("n,nai,naj->ij", weight, J, J)
-        b = np.einsum("n,nai,na->i", weight, J, r)
+        A, b, _ = cauchy_equations(r, J, _RULES.least_px)
         try:
             step = np.linalg.solve(A, b)
         except np.linalg.LinAlgError:

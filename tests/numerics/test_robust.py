@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vio.numerics.robust import jackknife, median, quantile, robust_sigma, robust_sigmas
+from vio.numerics.robust import (
+    cauchy_equations,
+    jackknife,
+    median,
+    quantile,
+    robust_sigma,
+    robust_sigmas,
+)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 100, 101])
@@ -64,3 +71,38 @@ def test_sigmas_of_columns_are_those_of_each(count: int) -> None:
     values[0, 1] = np.nan
     expected = [robust_sigma(column) for column in values.T]
     assert np.array_equal(robust_sigmas(values), expected, equal_nan=True)
+
+
+def test_equations_with_cauchys_weights_are_those_of_weighted_least_squares() -> None:
+    rng = np.random.default_rng(4)
+    r = rng.normal(0.0, 0.5, (40, 3))
+    J = rng.normal(0.0, 1.0, (40, 3, 5))
+    squared = (r**2).sum(axis=1)
+    W = np.diag((1.0 / (1.0 + squared / np.median(squared))).repeat(3))
+    equations = cauchy_equations(r, J, 0.1)
+    np.testing.assert_allclose(equations.matrix, J.reshape(-1, 5).T @ W @ J.reshape(-1, 5))
+    np.testing.assert_allclose(equations.vector, J.reshape(-1, 5).T @ W @ r.reshape(-1))
+    np.testing.assert_allclose(
+        equations.variance, np.sum(W.diagonal() * r.reshape(-1) ** 2) / W.trace()
+    )
+
+
+def test_equations_with_cauchys_weights_nearly_leave_out_what_is_far_off() -> None:
+    rng = np.random.default_rng(5)
+    J = rng.normal(0.0, 1.0, (200, 2, 3))
+    true = np.array([1.0, -2.0, 0.5])
+    x = np.zeros(3)
+    values = J @ true + rng.normal(0.0, 0.01, (200, 2))
+    values[:40] += 30.0
+    for _ in range(20):
+        A, b, variance = cauchy_equations(values - J @ x, J, 0.01)
+        x = x + np.linalg.solve(A, b)
+    np.testing.assert_allclose(x, true, atol=0.005)
+    assert 0.005 < np.sqrt(variance) < 0.02
+
+
+def test_cauchys_weights_are_no_narrower_than_stated() -> None:
+    r = np.full((10, 1), 1e-6)
+    r[0] = 0.3
+    J = np.ones((10, 1, 1))
+    np.testing.assert_allclose(cauchy_equations(r, J, 0.3).vector[0], 0.3 / 2 + 9e-6, rtol=1e-6)

@@ -1,8 +1,9 @@
-"""Robust standard deviations, and standard errors under correlated errors."""
+"""Robust standard deviations and least squares, and standard errors under correlated errors."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -65,6 +66,30 @@ def robust_sigmas(values: FloatArray) -> FloatArray:
         medians = 0.5 * (ordered[middle - 1] + medians)
     out: FloatArray = _MEDIAN_TO_SIGMA * np.where(np.isnan(ordered[-1]), np.nan, medians)
     return out
+
+
+class NormalEquations(NamedTuple):
+    """A Gauss-Newton step of K parameters, `matrix @ step = vector`."""
+
+    matrix: FloatArray  # (K, K)
+    vector: FloatArray  # (K,)
+    variance: float  # of a residual, by the weighted mean of their squares
+
+
+def cauchy_equations(r: FloatArray, J: FloatArray, least: float) -> NormalEquations:
+    """Weigh measurements by Cauchy's function of their size, whose width is the median one.
+
+    Args:
+        r: residuals (N, D); the D of a measurement count alike.
+        J: derivatives (N, D, K) of what is fitted to them.
+        least: width of a residual, at least.
+    """
+    squared = (r * r).sum(axis=1)
+    weight = 1.0 / (1.0 + squared / max(median(squared), r.shape[1] * least**2))
+    columns = J.reshape(r.size, -1)
+    weighted = (J * weight[:, None, None]).reshape(columns.shape)
+    variance = float((weight * squared).sum() / (r.shape[1] * weight.sum()))
+    return NormalEquations(weighted.T @ columns, weighted.T @ r.reshape(-1), variance)
 
 
 def jackknife(values: npt.ArrayLike) -> FloatArray:
