@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -584,6 +585,62 @@ def test_reports_both_degrees_and_inverted_extrinsics() -> None:
     it = _recording("room")
     found = _watch(it, samples=_gyro(it, np.degrees), T_cam0_imu=se3_inverse(it.T_cam0_imu))
     assert _faults(found) == ["extrinsics inverted", "gyro units"]
+
+
+# What happens during a run
+
+
+def _after(it: Watched, seconds: float, change: Callable[[ImuSample], ImuSample]) -> Watched:
+    """The recording, whose samples are others from a time after its first frame on."""
+    since = it.frames[0].time_ns + round(1e9 * seconds)
+    samples = [change(s) if s.time_ns >= since else s for s in it.samples]
+    return replace(it, samples=samples)
+
+
+def _without(it: Watched, first: int, count: int) -> Watched:
+    """The recording without some images, whose stamps go on."""
+    shown = [*it.frames[:first], *it.frames[first + count :]]
+    frames = [
+        replace(seen, frame_index=frame.frame_index, time_ns=frame.time_ns)
+        for seen, frame in zip(shown, it.frames, strict=False)
+    ]
+    return replace(it, frames=frames)
+
+
+_TURNED = se3_exp([0, 0, 0, 0.9, -0.4, 0.6])[:3, :3]
+_SINCE: dict[str, Callable[[Watched], Watched]] = {
+    "images are missing": lambda it: _without(it, 60, 25),
+    "it is turned": lambda it: _after(it, 3.0, lambda s: replace(s, gyro=_TURNED @ s.gyro)),
+    "it has other axes": lambda it: _after(it, 3.0, lambda s: replace(s, gyro=s.gyro[[1, 0, 2]])),
+    "it is another one": lambda it: _after(it, 3.0, lambda s: replace(s, gyro=-s.gyro[::-1] * 0.7)),
+}
+
+
+@pytest.mark.parametrize("change", _SINCE)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_gyro_that_has_agreed_at_first_has_no_wrong_units_or_axes(change: str, seed: int) -> None:
+    whole = _recording("room", seed)
+    it = _SINCE[change](replace(whole, frames=whole.frames[:130]))
+    (found,) = _watch(it)
+    assert found.fault == "gyro disagrees"
+    until = re.search(r"it agrees until (\S+) s after the first frame", found.message)
+    assert until is not None
+    assert 2.0 < float(until[1]) < 4.0
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("name", "mount"), [("room", "euroc"), ("slow", "forward")])
+def test_a_dead_axis_of_a_gyro_is_named(name: str, mount: str, axis: int) -> None:
+    it = _recording(name, 0, mount)
+    noise = np.random.default_rng(7)
+
+    def dead(w: FloatArray) -> FloatArray:
+        return np.where(np.arange(3) == axis, noise.normal(0.01, 0.005), w)
+
+    found = _watch(it, samples=_gyro(it, dead))[0]
+    assert found.fault == "gyro dead"
+    assert f"about {'xyz'[axis]} of the IMU" in found.message
+    assert found.is_disabling
 
 
 # Clocks

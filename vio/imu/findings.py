@@ -16,6 +16,7 @@ InertialFault: TypeAlias = Literal[
     "gyro units",
     "gyro sign",
     "gyro axes",
+    "gyro dead",
     "gyro disagrees",
     "extrinsics inverted",
     "extrinsics rotation",
@@ -37,6 +38,7 @@ _GROUPS: dict[str, tuple[InertialFault, ...]] = {
     "rotation": (
         "gyro sign",
         "gyro axes",
+        "gyro dead",
         "gyro disagrees",
         "extrinsics inverted",
         "extrinsics rotation",
@@ -65,6 +67,7 @@ _CODES: dict[InertialFault, str] = {
     "gyro units": "imu-units",
     "gyro sign": "imu-axes",
     "gyro axes": "imu-axes",
+    "gyro dead": "imu-readings",
     "gyro disagrees": "imu-disagrees",
     "extrinsics inverted": "imu-axes",
     "extrinsics rotation": "imu-axes",

@@ -110,6 +110,8 @@ class Evidence:
     last: bool  # no later evaluation will follow
     # of the IMU against `R_cam0_imu`; None: not clearly, or a filter estimates it
     turn: Turn | None = None
+    # in order of time, which may agree at first alone; None: they are in none
+    record: Record | None = None
 
     @property
     def brief(self) -> bool:

@@ -16,7 +16,7 @@ from vio.geometry.lie import FloatArray, nearest_rotation, so3_exp
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import AXES_WORSE, axes_text, signed_permutations
 from vio.monitor.force_fit import Evidence
-from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit
+from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit, agreed_until
 from vio.monitor.turned_imu import Turn
 
 
@@ -54,6 +54,9 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     gyro_fit = evidence.gyro_fit
     R = evidence.R_cam0_imu
     brief = evidence.brief
+    axis = gyro_fit.dead_axis(R)
+    if axis is not None and not evidence.clipped:
+        return [_dead(gyro_fit, R, axis)]
     if evidence.turn is not None:
         C = so3_exp(evidence.turn.rotation) @ R
         return [turned_finding(evidence.turn, R), *_judge_scale(evidence, C)]
@@ -64,7 +67,9 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
         enough = not brief or (evidence.last and gyro_fit.count >= _EXCESS.min_intervals)
         is_none = misfit > _EXCESS.as_none and enough
         is_off = gyro_fit.unexplained > _EXCESS.disagreeing_share and not brief
-        return [_disagreement(gyro_fit)] if is_off or (is_none and not evidence.clipped) else []
+        if is_off or (is_none and not evidence.clipped):
+            return [_unexplained(_disagreement(gyro_fit), evidence)]
+        return []
     limit = max(
         gyro_fit.tolerance, _EXCESS.clipped_share * evidence.clipped, _EXCESS.brief_share * brief
     )
@@ -72,7 +77,9 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
         return []
     if gyro_fit.is_chance:
         enough = not brief or (evidence.last and gyro_fit.count >= _EXCESS.min_intervals)
-        return [_disagreement(gyro_fit)] if enough and not evidence.clipped else []
+        if enough and not evidence.clipped:
+            return [_unexplained(_disagreement(gyro_fit), evidence)]
+        return []
     if gyro_fit.fits(R):
         return _judge_scale(evidence, R)
     if not evidence.force_final:
@@ -99,14 +106,27 @@ def _name_mistake(evidence: Evidence, unit: float) -> list[InertialFinding]:
     if uncertain:
         return []
     stretch = np.linalg.svd(gyro_fit.A, compute_uv=False)
-    return [
-        InertialFinding(
-            "gyro units",
-            f"{seen}, and no rotation fits: the best linear map stretches by "
-            f"{_triple_text(stretch)}",
-            "the gyro's axes have different scales, or one of them is dead",
-        )
-    ]
+    finding = InertialFinding(
+        "gyro units",
+        f"{seen}, and no rotation fits: the best linear map stretches by {_triple_text(stretch)}",
+        "the gyro's axes have different scales, or images or samples of some time are missing though "
+        "the stamps go on",
+    )
+    return [_unexplained(finding, evidence)]
+
+
+def _dead(gyro_fit: GyroFit, R: FloatArray, axis: int) -> InertialFinding:
+    """The finding of a gyro that shows nothing of rotations about an axis, mapped by a rotation
+    (3, 3).
+    """
+    by_camera = (R.T @ gyro_fit.S_cc @ R)[axis, axis]
+    camera, gyro = np.degrees(np.sqrt([by_camera, gyro_fit.S_gg[axis, axis]]))
+    return InertialFinding(
+        "gyro dead",
+        f"about {'xyz'[axis]} of the IMU the camera rotates at {camera:.1f} deg/s (RMS), the gyro "
+        f"at {gyro:.1f} deg/s, while the other axes agree",
+        "the gyro is dead about it, or its column is missing or another sensor's",
+    )
 
 
 def _gyro_alone(evidence: Evidence, unit: float) -> bool:
@@ -162,6 +182,25 @@ def backwards(gyro_fit: GyroFit) -> InertialFinding:
         _disagreement(gyro_fit),
         explanation="with the order of the images reversed the gyro agrees: they run backwards; "
         "number them in the order of their exposures, or reverse the list of their times",
+    )
+
+
+def _unexplained(finding: InertialFinding, evidence: Evidence) -> InertialFinding:
+    """A finding that no mistake explains: where the gyro has agreed at first, something has
+    happened since.
+    """
+    if evidence.record is None:
+        return finding
+    until_s = agreed_until(evidence.record, _EXCESS.min_intervals, evidence.R_cam0_imu)
+    if until_s is None:
+        return finding
+    return replace(
+        finding,
+        fault="gyro disagrees",
+        seen=f"{finding.seen}, though it agrees until {until_s:.1f} s after the first frame compared",
+        explanation="since then images or samples of some time are missing though the stamps go on, "
+        "a clock has jumped, the IMU has turned on the rig, or its driver was started again with "
+        "other settings",
     )
 
 

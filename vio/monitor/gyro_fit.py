@@ -14,7 +14,8 @@ from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, nearest_rotation
 from vio.imu.findings import MAX_FOLLOWED_OFFSET_S, InertialFinding
 from vio.monitor.motion import Record
-from vio.numerics.robust import robust_sigma
+from vio.numerics.kinds import Tolerance
+from vio.numerics.robust import robust_sigma, robust_sigmas
 from vio.records import BoolArray
 
 
@@ -30,6 +31,12 @@ class _RateRules(NamedTuple):
     chance_intervals: float = 30.0
     clearly_worse: float = 2.0
     named_offset_s: float = 0.02
+    # of the rotation, that a gyro leaves which agrees up to some interval, as it is given
+    left_share: float = 0.1
+    lengths: Tolerance[int] = 20  # of a record that are tried
+    # of the rate about an axis: what one that is dead shows of it at most, and by how much the
+    # others may be off
+    dead_share: float = 0.3
 
 
 _RATES = _RateRules()
@@ -87,8 +94,11 @@ class GyroFit:
     @property
     def axes(self) -> int:
         """Number of axes about which the camera clearly rotates."""
-        clear = max(_RATES.min_rate_radps, _RATES.clear_of_noise * self.noise_radps)
-        return int(np.sum(self.rms_rates_radps > clear))
+        return int(np.sum(self.rms_rates_radps > self._clear_radps))
+
+    @property
+    def _clear_radps(self) -> float:
+        return max(_RATES.min_rate_radps, _RATES.clear_of_noise * self.noise_radps)
 
     def scale(self, C: FloatArray) -> float:
         """Return the best factor on an orthogonal map (3, 3) from gyro to camera."""
@@ -111,6 +121,23 @@ class GyroFit:
             _RATES.excess_share,
             float(np.sqrt(_RATES.chance_intervals / max(self.count, 1) * self.unexplained)),
         )
+
+    def dead_axis(self, R: FloatArray) -> int | None:
+        """Return which axis of a gyro shows nothing of the rotation about it, while the others,
+        mapped by a rotation (3, 3), show all; None: it is not one of them.
+        """
+        camera = self.camera[self.covered] @ R
+        gyro = self.gyro[self.covered]
+        total, shown, off = (
+            robust_sigmas(rates - np.median(rates, axis=0))
+            for rates in (camera, gyro, camera - gyro)
+        )
+        clear = total > self._clear_radps
+        dead = clear & (shown < _RATES.dead_share * total)
+        if np.count_nonzero(dead) != 1 or np.count_nonzero(clear) < 2:
+            return None
+        axis = int(dead.argmax())
+        return axis if off[~dead].max() < _RATES.dead_share * total[axis] else None
 
     def fits(self, C: FloatArray) -> bool:
         """Return whether an orthogonal map (3, 3) from gyro to camera is accepted at its best
@@ -174,6 +201,29 @@ def fits_backwards(record: Record, least: int, R_cam0_imu: FloatArray) -> bool:
     if found is None or abs(found.offset_s) > MAX_FOLLOWED_OFFSET_S:
         return False
     return found.unexplained < AGREES and found.fits(R_cam0_imu)
+
+
+def agreed_until(record: Record, least: int, R_cam0_imu: FloatArray) -> float | None:
+    """Return the end, in seconds of a record's clock, of the first intervals in which the gyro,
+    mapped by the given rotation (3, 3), explains the camera's rotation; None: they are fewer than
+    `least`, or all.
+    """
+    noise = robust_sigma(np.diff(record.twists[:, 3:], 2, axis=0)) / np.sqrt(6)
+    count = len(record.twists)
+    until = None
+    for length in np.unique(np.linspace(least, count - 1, _RATES.lengths).astype(np.int64)):
+        head = replace(
+            record,
+            begin=record.begin[:length],
+            end=record.end[:length],
+            twists=record.twists[:length],
+        )
+        fit = _at_offset(head, np.zeros(1), least, noise)
+        if fit is None or not fit.axes:
+            continue
+        if fit.unexplained + fit.excess(R_cam0_imu, 1.0) ** 2 < _RATES.left_share:
+            until = float(head.end[-1])
+    return until
 
 
 def _search_far(record: Record, near: GyroFit, least: int, noise: float) -> GyroFit:

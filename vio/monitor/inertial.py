@@ -263,6 +263,7 @@ class InertialCheck:
         return Evidence(
             R_cam0_imu=self._T[:3, :3],
             gyro_fit=gyro_fit,
+            record=record,
             force=force,
             early_force=early,
             # The accelerometer decides whether gyro or extrinsics are at fault: wait for it.
@@ -403,6 +404,7 @@ class InertialCheck:
         evidence = Evidence(
             R_cam0_imu=self._T[:3, :3],
             gyro_fit=gyro_fit,
+            record=record,
             force=None,
             early_force=None,
             force_final=True,  # what axes and unit are at fault is not asked yet
