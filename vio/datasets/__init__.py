@@ -35,6 +35,7 @@ MODULES = [
 _FILES = (".npz", ".mat", ".bag", ".db3", ".mcap")  # recordings that are one file
 _MAX_LOOKED_AT = 200  # of what a folder holds that is no recording itself
 _MAX_NAMED = 3  # of the recordings in it
+_LEVELS_ABOVE = 3  # folders in which a file of a recording may lie
 _DEMO = Path("demo/street")  # that the documentation's examples read
 
 
@@ -219,7 +220,20 @@ def _unknown(path: Path) -> str:
                 f"{path}: holds the videos {listed(sorted(films))}, which are no pair by their names; "
                 "name them left and right, the parts of a long one joined"
             )
+    if path.is_file() and (folder := _recording_of(path)) is not None:
+        return f"{path}: is a file of the recording {folder}; give that folder"
     return f"{path}: no known recording; looked for {_looked_for()}"
+
+
+def _recording_of(path: Path) -> Path | None:
+    """Return the folder that holds a file and is a recording; None: none does."""
+    for folder in path.absolute().parents[:_LEVELS_ABOVE]:
+        try:
+            if _kind_of_folder(folder) is not None:
+                return folder
+        except (OSError, DataError):  # holds several, or cannot be listed
+            return None
+    return None
 
 
 def _folder_kind(path: Path) -> str | None:
