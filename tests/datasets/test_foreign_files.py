@@ -63,8 +63,10 @@ def test_what_takes_the_place_of_another_thing_is_named(
     assert "the page is HTML; name it page.html" in refused(
         capsys, "report", run, "--out", tmp_path / "page.pdf"
     )
-    assert f"is a file of the recording {flight / 'mav0'}; give that folder" in refused(
-        capsys, "inspect", table
+    for part in (table, flight / "mav0" / "cam0", flight / "mav0" / "cam0" / "data"):
+        assert "is a part of the recording" in refused(capsys, "inspect", part)
+    assert "is a folder; give a file of poses" in refused(
+        capsys, "run", flight, "--reference", flight, "--out", tmp_path / "out"
     )
     assert "is a map of vio run, which is not read; give the recording" in refused(
         capsys, "run", tmp_path / "yard.map"

@@ -46,9 +46,9 @@ def test_settings_of_a_run_are_no_path() -> None:
 
 def test_trajectories_and_lists_are_asked_for_where_paths_and_texts_are_given() -> None:
     poses = Trajectory(np.tile(np.eye(4), (3, 1, 1)), None, "cam0")
-    with pytest.raises(TypeError, match="reference: give a Trajectory, .*, not str"):
+    with pytest.raises(TypeError, match=r"reference: give a Trajectory, .*, not str"):
         vio.evaluate(poses, "truth.txt")  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="estimate: give a Trajectory, .*, not ndarray"):
+    with pytest.raises(TypeError, match=r"estimate: give a Trajectory, .*, not ndarray"):
         vio.evaluate(poses.T_world_body, poses)  # type: ignore[arg-type]
     for given in ("motion=none", {"motion": "none"}):
         with pytest.raises(ConfigError, match=r"give a list such as \['motion=none'\], not"):

@@ -183,6 +183,8 @@ def _unknown(path: Path) -> str:
     from vio.datasets.plain import ALONE, images_of_one_camera
     from vio.datasets.unused import listed, unread_files
 
+    if (whole := _recording_of(path)) is not None:
+        return f"{path}: is a part of the recording {whole}; give that folder"
     if path.is_dir() and len(plain.image_folders(path)) > 1:
         return (
             f"{path}: holds {plain.seen_folders(path)}, but it is not clear which is the left and "
@@ -220,13 +222,11 @@ def _unknown(path: Path) -> str:
                 f"{path}: holds the videos {listed(sorted(films))}, which are no pair by their names; "
                 "name them left and right, the parts of a long one joined"
             )
-    if path.is_file() and (folder := _recording_of(path)) is not None:
-        return f"{path}: is a file of the recording {folder}; give that folder"
     return f"{path}: no known recording; looked for {_looked_for()}"
 
 
 def _recording_of(path: Path) -> Path | None:
-    """Return the folder that holds a file and is a recording; None: none does."""
+    """Return the recording that holds a file or a folder; None: none does."""
     for folder in path.absolute().parents[:_LEVELS_ABOVE]:
         try:
             if _kind_of_folder(folder) is not None:

@@ -141,6 +141,8 @@ def read_trajectory(
             f"unknown trajectory format {fmt!r}; choose one of "
             f"{', '.join(get_args(TrajectoryFormat))}"
         )
+    if Path(path).is_dir():
+        raise DataError(f"{path}: is a folder; give a file of poses")
     table = _read_table(Path(path))
     if not table.rows:
         raise DataError(f"{table.path}: holds no poses; give a TUM, KITTI or EuRoC trajectory file")
