@@ -174,7 +174,8 @@ def _named_columns(cells: Sequence[str], *, w_first: bool) -> PoseColumns | None
     unit = time_unit(cells[stamp])
     nanoseconds = None
     if names[stamp] in ("sec", "secs", "seconds") and "nsec" in names[after : after + 1]:
-        unit, nanoseconds = "s", after
+        unit = "s"
+        nanoseconds = after
     to_metres = _to_metres([cells[k] for k in position])
     return PoseColumns(stamp, (a, b, c), of_turn, orientations, unit, to_metres, nanoseconds)
 
