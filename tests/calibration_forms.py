@@ -20,7 +20,7 @@ import vio
 from vio.cameras.rig import Rig
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import VioError
-from vio.geometry.distortion import CameraModel
+from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import (
     FloatArray,
     quat_xyzw_from_rotation,
@@ -575,6 +575,94 @@ def _opencv_other_names(folder: Path) -> Path:
     return _save(folder, path.name, text)
 
 
+def openvslam(folder: Path, *, block: bool = False) -> Path:
+    """OpenVSLAM's settings of a rectified pair; stella_vslam's, which have a block."""
+    c = rectified_rig().cam0
+    values: dict[str, object] = {
+        "setup": "stereo",
+        "model": "perspective",
+        **dict(zip(("fx", "fy", "cx", "cy"), _intrinsics(c), strict=True)),
+        **dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0),
+        "cols": c.width,
+        "rows": c.height,
+        "focal_x_baseline": c.fu * 0.11,
+    }
+    if block:
+        return _save(folder, "config.yaml", yaml.safe_dump({"Camera": values}))
+    text = "".join(f"Camera.{key}: {value}\n" for key, value in values.items())
+    return _save(folder, "config.yaml", text)
+
+
+def stella_raw(folder: Path) -> Path:
+    """stella_vslam's settings of raw images, which it rectifies."""
+    import cv2
+
+    cams = true_rig().cameras
+    D = [np.array([*c.coefficients, 0.0]) for c in cams]
+    R, t = T_CAM1_CAM0[:3, :3], T_CAM1_CAM0[:3, 3:]
+    R0, R1, P0, P1, *_ = cv2.stereoRectify(cams[0].K, D[0], cams[1].K, D[1], SIZE, R, t)
+    settings = yaml.safe_load(openvslam(folder, block=True).read_text())
+    for key, value in (("fx", P0[0, 0]), ("fy", P0[1, 1]), ("cx", P0[0, 2]), ("cy", P0[1, 2])):
+        settings["Camera"][key] = float(value)
+    settings["Camera"]["focal_x_baseline"] = float(-P1[0, 3])
+    block: dict[str, object] = {"model": "perspective"}
+    for side, c, d, turn in zip(("left", "right"), cams, D, (R0, R1), strict=True):
+        matrices = {"K": c.K, "D": d, "R": np.asarray(turn)}
+        block |= {f"{name}_{side}": M.ravel().tolist() for name, M in matrices.items()}
+    return _save(folder, "config.yaml", yaml.safe_dump({**settings, "StereoRectifier": block}))
+
+
+_EDEX_PLACES = {
+    "pinhole": (),
+    "brown": (0, 1, 4, 2, 3),
+    "fisheye": (0, 1, 2, 3),
+    "polynomial": (0, 1, 2, 3, 4, 5, 6, 7),
+}
+
+
+def edex(folder: Path, rig: Rig, lens: str) -> Path:
+    """cuVSLAM's scene, in OpenGL's axes."""
+    flip = np.diag([1.0, -1.0, -1.0])
+    cameras = []
+    for c, T_rig_cam in zip(rig.cameras, (np.eye(4), se3_inverse(rig.right[1])), strict=True):
+        D = (*c.coefficients, *[0.0] * 8)
+        intrinsics = {
+            "distortion_model": lens,
+            "distortion_params": [D[k] for k in _EDEX_PLACES[lens]],
+            "focal": [c.fu, c.fv],
+            "principal": [c.cu, c.cv],
+            "size": [c.width, c.height],
+        }
+        turned = np.column_stack([flip @ T_rig_cam[:3, :3] @ flip, flip @ T_rig_cam[:3, 3]])
+        cameras.append({"intrinsics": intrinsics, "transform": turned.tolist()})
+    scene = [
+        {"version": "0.9", "cameras": cameras},
+        {"fps": 10, "sequence": [["a.png"], ["b.png"]]},
+    ]
+    return _save(folder, "stereo.edex", json.dumps(scene))
+
+
+def spectacular(folder: Path, model: DistortionModel = "radtan") -> Path:
+    """The calibration of Spectacular AI's SDK."""
+    rig = true_rig(model)
+    names = {"pinhole": "pinhole", "radtan": "brown-conrady", "equidistant": "kannala-brandt4"}
+    cameras = []
+    for c, T in zip(rig.cameras, (T_CAM0_IMU, T_CAM1_CAM0 @ T_CAM0_IMU), strict=True):
+        D = [*c.coefficients, *[0.0] * (4 if model == "radtan" else 0)]
+        cameras.append(
+            {
+                "model": names[model],
+                "focalLengthX": c.fu,
+                "focalLengthY": c.fv,
+                "principalPointX": c.cu,
+                "principalPointY": c.cv,
+                "distortionCoefficients": D,
+                "imuToCamera": T.tolist(),
+            }
+        )
+    return _save(folder, "calibration.json", json.dumps({"cameras": cameras}))
+
+
 def _kitti(folder: Path) -> Path:
     c = rectified_rig().cam0
     P0 = np.column_stack([c.K, np.zeros(3)])
@@ -639,6 +727,9 @@ FORMS = (
         imu_free(rectified_rig()),
         SIZE,
     ),
+    Form("OpenVSLAM", "`Camera.focal_x_baseline`", openvslam, imu_free(rectified_rig())),
+    Form("stella_vslam", "`Camera:`", lambda f: openvslam(f, block=True), imu_free(rectified_rig())),
+    Form("stella_vslam", "likewise, `StereoRectifier:`", stella_raw, imu_free(true_rig())),
     Form(
         "VINS-Fusion",
         "settings and camodocal's `PINHOLE`",
@@ -682,6 +773,43 @@ FORMS = (
         row=False,
     ),
     Form("DepthAI", "likewise, `cameraType` 3", lambda f: depthai_of(f, 3), None),
+    Form("cuVSLAM", "`stereo.edex`", lambda f: edex(f, true_rig(), "brown"), imu_free(true_rig())),
+    Form(
+        "cuVSLAM",
+        "likewise, `fisheye`",
+        lambda f: edex(f, true_rig("equidistant"), "fisheye"),
+        imu_free(true_rig("equidistant")),
+        row=False,
+    ),
+    Form(
+        "cuVSLAM",
+        "likewise, `pinhole`",
+        lambda f: edex(f, rectified_rig(), "pinhole"),
+        imu_free(rectified_rig()),
+        row=False,
+    ),
+    Form(
+        "cuVSLAM",
+        "likewise, `polynomial`",
+        lambda f: edex(f, true_rig(), "polynomial"),
+        imu_free(true_rig()),
+        row=False,
+    ),
+    Form(
+        "Spectacular AI",
+        "`calibration.json`, no size",
+        spectacular,
+        replace(true_rig(), imu_noise=None, time_offset_s=0.0),
+        SIZE,
+    ),
+    Form(
+        "Spectacular AI",
+        "likewise, `kannala-brandt4`",
+        lambda f: spectacular(f, "equidistant"),
+        replace(true_rig("equidistant"), imu_noise=None, time_offset_s=0.0),
+        SIZE,
+        row=False,
+    ),
     Form("Monado", "`calibration_v2` JSON, `pinhole_radtan5`", monado, imu_free(true_rig())),
     Form(
         "Monado",

@@ -125,6 +125,10 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     Raises:
         ConfigError: the file cannot be read, or a key or value is wrong.
     """
+    if isinstance(overrides, (str, dict)):
+        raise ConfigError(
+            f"overrides: give a list such as ['motion=none'], not {type(overrides).__name__}"
+        )
     config = Config()
     if path is not None:
         config = merge(config, _read_yaml(_preset_or(Path(path))), where=str(path))

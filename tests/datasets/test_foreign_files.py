@@ -53,6 +53,65 @@ def test_results_are_no_recording(run: Path, capsys: pytest.CaptureFixture[str])
     assert "no recording is named" in refused(capsys, "run", "")
 
 
+def test_what_takes_the_place_of_another_thing_is_named(
+    flight: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = flight / "mav0" / "imu0" / "data.csv"
+    (tmp_path / "yard.map").write_bytes(b"SQLite format 3\0")
+    message = f"{flight} is a recording, and {run} a run: name the run first"
+    assert message in refused(capsys, "eval", flight, run)
+    assert "the page is HTML; name it page.html" in refused(
+        capsys, "report", run, "--out", tmp_path / "page.pdf"
+    )
+    for part in (table, flight / "mav0" / "cam0", flight / "mav0" / "cam0" / "data"):
+        assert "is a part of the recording" in refused(capsys, "inspect", part)
+    assert "is a folder; give a file of poses" in refused(
+        capsys, "run", flight, "--reference", flight, "--out", tmp_path / "out"
+    )
+    assert "is a map of vio run, which is not read; give the recording" in refused(
+        capsys, "run", tmp_path / "yard.map"
+    )
+    assert "is neither the folder of a run nor a map; that comes first" in refused(
+        capsys, "georeference", table, run, "--out", tmp_path / "earth"
+    )
+    assert "is no map of this program" in refused(capsys, "map", "check", table)
+
+
+@pytest.mark.parametrize(("arm", "named"), [("30,0,120", True), ("1.5,0,3", False)])
+def test_a_lever_arm_longer_than_a_vehicle_is_doubted(
+    arm: str, named: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    from vio.cli.georeference import _lever_arm
+
+    _lever_arm(arm)
+    assert ("longer than a vehicle; --lever-arm takes metres" in caplog.text) == named
+
+
+def test_pixels_of_other_types_are_named(tmp_path: Path) -> None:
+    import cv2
+
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        cv2.imwrite(str(tmp_path / side / "0.tiff"), np.zeros((48, 64), dtype=np.float32))
+    with pytest.raises(
+        DataError, match="its pixels are float32, and images of 8 or 16 bits are read"
+    ):
+        open_dataset(tmp_path)
+
+
+def test_files_that_may_be_calibrations_are_named_where_none_is_read(
+    flight: Path, tmp_path: Path
+) -> None:
+    for side, camera in (("left", "cam0"), ("right", "cam1")):
+        shutil.copytree(flight / "mav0" / camera / "data", tmp_path / side)
+    (tmp_path / "settings.yaml").write_text("Feature: {max: 2000}\n")
+    (tmp_path / "imu.yaml").write_text("gyroscope_noise_density: 1e-4\n")
+    with pytest.raises(
+        DataError, match=r"no calibration; .*; of no form that is read: settings.yaml$"
+    ):
+        open_dataset(tmp_path)
+
+
 def test_images_without_a_calibration_are_named(flight: Path, tmp_path: Path) -> None:
     shutil.copytree(flight / "mav0" / "cam0" / "data", tmp_path / "left")
     with pytest.raises(

@@ -12,6 +12,7 @@ from tests.plain_maker import make_plain
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
 from vio.datasets.tables import names_readings
+from vio.errors import DataError
 from vio.records import ImuSample
 
 Row = tuple[int, np.ndarray]  # time in nanoseconds, gyro and accel (6,)
@@ -74,6 +75,34 @@ FORMS: dict[str, tuple[str, Callable[[int, list[str]], list[str]]]] = {
 }
 
 
+FORMS |= {
+    "ticks of a tenth of a millisecond": (
+        "PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z,Roll,Pitch,Yaw",
+        lambda t, v: ["7", str(t // 100_000), *v[3:], *v[:3], "1", "2", "3"],
+    ),
+    "axes before sensors": (
+        "GPS TFlags,GPS Week,GPS TOW [ns],X Accel,Y Accel,Z Accel,X Gyro,Y Gyro,Z Gyro",
+        lambda t, v: ["6", "2260", str(t), *v[3:], *v[:3]],
+    ),
+    "shortened names": (
+        "timestamp [ns],imu_lin_acc_x,imu_lin_acc_y,imu_lin_acc_z,imu_ang_vel_x,imu_ang_vel_y,imu_ang_vel_z",
+        lambda t, v: [str(t), *v[3:], *v[:3]],
+    ),
+    "dates in several columns": (
+        "n,UTC_Nano,UTC_Year,UTC_Month,UTC_Day,UTC_Hour,UTC_Minute,UTC_Second,Acc_X,Acc_Y,Acc_Z,"
+        "Gyr_X,Gyr_Y,Gyr_Z",
+        lambda t, v: ["1", str(t % 10**9), *_date(t), *v[3:], *v[:3]],
+    ),
+}
+
+
+def _date(t_ns: int) -> list[str]:
+    whole = np.datetime64(t_ns // 10**9, "s").astype(object)
+    return [
+        str(getattr(whole, part)) for part in ("year", "month", "day", "hour", "minute", "second")
+    ]
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_the_columns_of_a_logger_are_found_by_their_names(form: str, tmp_path: Path) -> None:
     folder = make_plain(tmp_path)
@@ -83,6 +112,23 @@ def test_the_columns_of_a_logger_are_found_by_their_names(form: str, tmp_path: P
     assert [t for t, _ in found] == [t for t, _ in expected]
     np.testing.assert_array_equal([v for _, v in found], [v for _, v in expected])
     assert not any("doubtful" in note for note in open_dataset(folder).recording.notes)
+
+
+def test_columns_of_no_date_are_refused(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    cells = lambda t, v: ["2024", "13", "1", "1", "1", "1.5", *v]  # noqa: E731
+    header = "year,month,day,hour,minute,second,gx,gy,gz,ax,ay,az"
+    (folder / "imu.csv").write_text(_text(header, _samples(folder), cells))
+    with pytest.raises(DataError, match="line 2: its columns of year to second hold no date"):
+        _samples(folder)
+
+
+def test_lines_that_name_their_sensor_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    cells = lambda t, v: [str(t), "GYROSCOPE_RAW", *v[:3]]  # noqa: E731
+    (folder / "imu.csv").write_text(_text("ts,sensor,x,y,z", _samples(folder), cells))
+    with pytest.raises(DataError, match="'GYROSCOPE_RAW' says whose a line is, write the lines of"):
+        _samples(folder)
 
 
 def test_one_imu_of_a_log_that_holds_several_is_read(tmp_path: Path) -> None:

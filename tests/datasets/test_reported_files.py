@@ -341,6 +341,18 @@ def test_stamps_behind_names_of_several_words_pair_images(tmp_path: Path) -> Non
     assert open_dataset(folder).recording.frame_times_ns.tolist() == STAMPS
 
 
+def test_a_number_of_the_kind_of_image_may_stand_before_a_stamp(tmp_path: Path) -> None:
+    """AirSim's `img_Drone_front_left_custom_0_1700…`."""
+    folder = make_plain(
+        tmp_path,
+        name=lambda side, k: f"img_Drone_front_{('left', 'right')[side]}_custom_0_{STAMPS[k]}.png",
+        times=False,
+        imu=False,
+        reference=False,
+    )
+    assert open_dataset(folder).recording.frame_times_ns.tolist() == STAMPS
+
+
 def test_a_second_calibration_is_named(tmp_path: Path) -> None:
     folder = make_plain(tmp_path)
     chain = (folder / "camchain-imucam.yaml").read_text()

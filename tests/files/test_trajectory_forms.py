@@ -90,6 +90,14 @@ STATED = {
         [ZERO[:, 0], *XYZW, ZERO[:, :3]],
         ",",
     ),
+    "metres and millimetres in names": (
+        "time_ns,frame,x_mm,y_mm,z_mm,q_w,q_x,q_y,q_z",
+        NS,
+        [ZERO[:, 0], 1000 * P, *WXYZ[1:]],
+        ",",
+    ),
+    "centimetres in brackets": ("# t [ns] x [cm] y [cm] z [cm] qx qy qz qw", NS, [100 * P, Q], " "),
+    "east, north, up": ("time_ns,easting,northing,altitude,qx,qy,qz,qw", NS, XYZW, ","),
     "rostopic": (
         "%time [ns],field.header.seq,field.pose.position.x,field.pose.position.y,"
         "field.pose.position.z,field.pose.orientation.x,field.pose.orientation.y,"
@@ -109,6 +117,98 @@ def test_what_a_header_states_is_believed(form: str, tmp_path: Path) -> None:
     assert found.orientations == "stated"
     np.testing.assert_array_equal(found.times_ns, TIMES_NS)
     np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+NUMBERED = {
+    "flight controller": (
+        "timestamp [ns],position[0],position[1],position[2],q[0],q[1],q[2],q[3],velocity[0]",
+        [*WXYZ, ZERO[:, 0]],
+        "w first, assumed",
+    ),
+    "from one": ("timestamp [ns],p1,p2,p3,q1,q2,q3,q4", WXYZ, "w first, assumed"),
+}
+
+
+@pytest.mark.parametrize("form", NUMBERED)
+def test_components_may_have_numbers(form: str, tmp_path: Path) -> None:
+    header, columns, orientations = NUMBERED[form]
+    found = read_trajectory(_write(tmp_path / "poses.csv", header, NS, columns, ","))
+    assert found.orientations == orientations
+    np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+ALONE = {
+    "angles": ("time_ns,x,y,z,roll,pitch,yaw", [P, ZERO[:, :3]], ","),
+    "angles and a state": ("time_ns,x,y,z,roll,pitch,yaw,status", [P, ZERO[:, :4]], ","),
+    "angles between white space": ("time_ns x y z roll pitch yaw", [P, ZERO[:, :3]], " "),
+    "a heading": ("time_ns,ref_ns,x,y,z,vx,vy,vz,heading", [ZERO[:, 0], P, ZERO[:, :4]], ","),
+    "an inertial system": (
+        "timestamp [ns],ins_status,latitude,longitude,altitude,easting,northing,up,roll,pitch,yaw",
+        [ZERO[:, :4], P, ZERO[:, :3]],
+        ",",
+    ),
+    "a speed": ("time_ns,x,y,z,speed", [P, ZERO[:, 0]], ","),
+}
+
+
+@pytest.mark.parametrize("form", ALONE)
+def test_positions_beside_angles_are_read_alone(form: str, tmp_path: Path) -> None:
+    header, columns, separator = ALONE[form]
+    found = read_trajectory(_write(tmp_path / "poses.csv", header, NS, columns, separator))
+    assert found.orientations == "none"
+    np.testing.assert_array_equal(found.times_ns, TIMES_NS)
+    np.testing.assert_allclose(found.positions, P, atol=1e-12)
+
+
+def test_north_east_and_down_are_right_handed(tmp_path: Path) -> None:
+    header = "time_ns,easting,northing,down,roll"
+    file = _write(tmp_path / "poses.csv", header, NS, [P, ZERO[:, 0]], ",")
+    np.testing.assert_allclose(read_trajectory(file).positions, P[:, [1, 0, 2]], atol=1e-12)
+
+
+REFUSED = {
+    "two times a row": (
+        "source_timestamp,destination_timestamp,x,y,z,roll,pitch,yaw\n2,1,0,0,0,0,0,0\n",
+        "names two times a row, as of motions from one to the other",
+    ),
+    "two units": (
+        "t,x_mm,y_mm,z_cm,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n",
+        "several units of the position",
+    ),
+    "COLMAP": (
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n1 1 0 0 0 0 0 0 1 0.png\n",
+        "is a model of COLMAP, whose poses map the world to each camera",
+    ),
+    "JSON": ('{"frames": []}\n', "is JSON; write a table of 8 columns"),
+    "Motive": (
+        "Format Version,1.23,Take Name,a\n,,Rigid Body\n",
+        "is an export of Motive or Vicon",
+    ),
+    "an IMU": (
+        "time,wx,wy,wz,ax,ay,az,temp\n1,0,0,0,9,1,2,3\n",
+        r"its header \(time, wx, wy, wz, …\) names no pose: give a table of poses",
+    ),
+    "no times": ("1 2 3 0 0 0 1\n", "a position and a quaternion lack the time in front"),
+    "angles without a header": ("1,2,3,4,5,6,7\n", "give the first four columns alone"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_are_no_poses_is_refused_by_what_it_is(case: str, tmp_path: Path) -> None:
+    text, message = REFUSED[case]
+    (tmp_path / "poses.txt").write_text(text)
+    with pytest.raises(DataError, match=message):
+        read_trajectory(tmp_path / "poses.txt")
+
+
+@pytest.mark.parametrize(
+    ("data", "kind"),
+    [(b"\x93NUMPY\x01\x00", "an array of NumPy"), (b"PK\x03\x04\xff", "a ZIP archive")],
+)
+def test_binary_files_of_poses_are_named(data: bytes, kind: str, tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_bytes(data)
+    with pytest.raises(DataError, match=f"it is {kind}.*: write it as text"):
+        read_trajectory(tmp_path / "poses.txt")
 
 
 def test_seconds_and_nanoseconds_in_two_columns(tmp_path: Path) -> None:

@@ -7,10 +7,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import vio
 from vio.config import Config
+from vio.errors import ConfigError
+from vio.records import Trajectory
 
 RIG = vio.Rig.rectified(300.0, 300.0, 159.5, 119.5, 0.1, 320, 240)
 
@@ -39,3 +42,14 @@ def test_settings_of_a_run_are_no_path() -> None:
     settings: Any = "settings.yaml"
     with pytest.raises(TypeError, match=r"give what vio.load_config\(...\) returns, not str"):
         vio.run(dataset, settings)
+
+
+def test_trajectories_and_lists_are_asked_for_where_paths_and_texts_are_given() -> None:
+    poses = Trajectory(np.tile(np.eye(4), (3, 1, 1)), None, "cam0")
+    with pytest.raises(TypeError, match=r"reference: give a Trajectory, .*, not str"):
+        vio.evaluate(poses, "truth.txt")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"estimate: give a Trajectory, .*, not ndarray"):
+        vio.evaluate(poses.T_world_body, poses)  # type: ignore[arg-type]
+    for given in ("motion=none", {"motion": "none"}):
+        with pytest.raises(ConfigError, match=r"give a list such as \['motion=none'\], not"):
+            vio.load_config(overrides=given)  # type: ignore[arg-type]

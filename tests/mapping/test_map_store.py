@@ -153,7 +153,7 @@ def test_a_missing_map_is_refused_with_the_remedy(tmp_path: Path) -> None:
 def test_files_that_are_no_map_are_refused_and_left_alone(tmp_path: Path) -> None:
     text, other = tmp_path / "text.map", tmp_path / "other.map"
     text.write_text("not a database, but long enough to look like one: " * 40)
-    with pytest.raises(DataError, match="is damaged or no map"):
+    with pytest.raises(DataError, match="is no map of this program, or its beginning"):
         MapStore(text, create=True)
     foreign = sqlite3.connect(other)
     foreign.execute("CREATE TABLE mine (x)")

@@ -133,7 +133,7 @@ def columns(text: str) -> tuple[str, ...]:
 
 def execute(args: argparse.Namespace) -> int:
     _check_plot(args)
-    estimates = {path: _read(path) for path in args.estimates}
+    estimates = {path: _read(path, args.reference) for path in args.estimates}
     reference = _read(args.reference)
     results = {
         str(path): _evaluated(args, estimate, _numbered(path, reference))
@@ -318,9 +318,16 @@ def _numbered(
     return numbered_by_images(reference[0], read_image_numbers(estimate)), reference[1]
 
 
-def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
+def _read(path: Path, compared_with: Path | None = None) -> tuple[Trajectory, FloatArray | None]:
     """Read a trajectory file, a run's folder or a COLMAP model, with the extrinsics if it has
     them.
+
+    Args:
+        path: of it.
+        compared_with: the reference that this is an estimate beside; None: this is a reference.
+
+    Raises:
+        DataError: it cannot be read, or a recording is compared with a run, not the run with it.
     """
     from vio.runs.files import RunFile
     from vio.runs.stated import read_run
@@ -332,7 +339,13 @@ def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
         quiet()
         if model_folder(path) is not None:
             return read_colmap_trajectory(path), None
-        return _truth_of(path)
+        truth = _truth_of(path)
+        if compared_with is not None and (compared_with / RunFile.METRICS).is_file():
+            raise DataError(
+                f"{path} is a recording, and {compared_with} a run: name the run first, then the "
+                "reference"
+            )
+        return truth
     return read_run(path)
 
 

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vio.cli.output import print_result
-from vio.errors import NOTE, ConfigError
+from vio.errors import NOTE, ConfigError, DataError
 from vio.files.printable import json_text
 
 if TYPE_CHECKING:
     from vio.geometry.lie import FloatArray
+
+_LONG_ARM_M = 20.0  # of an antenna on a vehicle, beyond which its unit is doubted
 
 
 def add_parser(commands: Any) -> None:
@@ -67,6 +69,11 @@ def execute(args: argparse.Namespace) -> int:
     lever_arm_m = _lever_arm(args.lever_arm)
     if not math.isfinite(args.time_offset) or abs(args.time_offset) > 4e9:
         raise ConfigError(f"--time-offset takes seconds, got {args.time_offset:g}")
+    if args.path.is_file() and not is_map(args.path):
+        raise DataError(
+            f"{args.path}: is neither the folder of a run nor a map; that comes first, then the GNSS "
+            "positions"
+        )
     of = placed(args.path)
     if is_map(args.gnss):
         fixes = None
@@ -103,6 +110,12 @@ def _lever_arm(text: str) -> FloatArray:
     if lever_arm_m.shape != (3,) or not (np.abs(lever_arm_m) < 1e3).all():
         raise ConfigError(
             f"--lever-arm takes three numbers in metres such as 0.1,0,-0.5, got {text}"
+        )
+    length_m = float(np.linalg.norm(lever_arm_m))
+    if length_m > _LONG_ARM_M:
+        logging.getLogger(__name__).warning(
+            "the lever arm is %.4g m long, longer than a vehicle; --lever-arm takes metres",
+            length_m,
         )
     return lever_arm_m
 

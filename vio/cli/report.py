@@ -14,6 +14,8 @@ from vio.errors import NOTE, DataError
 
 log = logging.getLogger(__name__)
 
+_OTHER_FORMS = (".pdf", ".png", ".md", ".csv", ".json", ".txt")  # whose readers take no HTML
+
 
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
@@ -66,6 +68,8 @@ def write(
         ) from error
     runs = with_distinct_names([read_finished_run(folder, reference) for folder in folders])
     out = out or folders[0] / RunFile.REPORT
+    if out.suffix.lower() in _OTHER_FORMS:
+        raise DataError(f"{out}: the page is HTML; name it {out.with_suffix('.html').name}")
     check_new_file(out, b'<p class="remark">stereo-vio')
     with stage("writing the report"):
         write_report(out, runs)

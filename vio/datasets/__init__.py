@@ -5,6 +5,7 @@ A source is a path whose kind is detected from its content, or `kind:path`.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import os
 from collections.abc import Iterator
@@ -35,6 +36,8 @@ MODULES = [
 _FILES = (".npz", ".mat", ".bag", ".db3", ".mcap")  # recordings that are one file
 _MAX_LOOKED_AT = 200  # of what a folder holds that is no recording itself
 _MAX_NAMED = 3  # of the recordings in it
+_LEVELS_ABOVE = 3  # folders in which a file of a recording may lie
+_INNER = ("data", "data_rect")  # folders of images in that of a camera
 _DEMO = Path("demo/street")  # that the documentation's examples read
 
 
@@ -180,8 +183,10 @@ def _unknown(path: Path) -> str:
     """Say what is missing where there are images or a video, else what was looked for."""
     from vio.datasets import images, plain, videos
     from vio.datasets.plain import ALONE, images_of_one_camera
-    from vio.datasets.unused import listed, unread_files
+    from vio.datasets.unused import foreign_file, listed, unread_files
 
+    if foreign_file(path) is None and (whole := _recording_of(path)) is not None:
+        return f"{path}: is a part of the recording {whole}; give that folder"
     if path.is_dir() and len(plain.image_folders(path)) > 1:
         return (
             f"{path}: holds {plain.seen_folders(path)}, but it is not clear which is the left and "
@@ -220,6 +225,22 @@ def _unknown(path: Path) -> str:
                 "name them left and right, the parts of a long one joined"
             )
     return f"{path}: no known recording; looked for {_looked_for()}"
+
+
+def _recording_of(path: Path) -> Path | None:
+    """Return the folder that holds a file or a folder beside, or of, the images of two cameras; None:
+    none does.
+    """
+    from vio.datasets.plain import pair_layout
+
+    for folder in path.absolute().parents[:_LEVELS_ABOVE]:
+        with contextlib.suppress(OSError, DataError):  # cannot be listed
+            layout = pair_layout(folder)
+            if layout is not None:
+                own = layout.left.parent
+                home = own.parent if layout.left.name in _INNER else own
+                return home if home in path.absolute().parents else None
+    return None
 
 
 def _folder_kind(path: Path) -> str | None:

@@ -66,6 +66,10 @@ _REFERENCES = (
 _NAMED_TRUTH = re.compile(r"truth|pose|vicon|mocap|optitrack|leica|(?:^|_)gt(?:_|$)")
 _LONG_SHIFT_S = 1.0  # as of one that was written in milliseconds
 _CALIBRATION_FOLDERS = ("", "dso", "calibration", "calib", "extras")
+# of files that may be calibrations, and names of those beside them that are none
+_OF_CALIBRATIONS = (".yaml", ".yml", ".json", ".xml", ".conf", ".ini", ".npz", ".mat", ".edex")
+_NO_CALIBRATION = ("imu", "conversion", "simulation", "metrics", "config")
+_NAMED = 3  # of these
 _SHARED_FOLDERS = ("calibration", "extras")  # of 4Seasons and Monado
 
 
@@ -106,8 +110,23 @@ def find_calibration_of(layout: Layout) -> Path:
         f"{layout.root}: no calibration; add one as calibration.yaml (Kalibr's camchain, OpenCV's "
         "M1 D1 M2 D2 R T), "
         "calib.txt (KITTI's) or another that vio.load_rig reads, or name it with "
-        "--calibration FILE; vio calibrate-rig makes one from a printed board"
+        f"--calibration FILE; vio calibrate-rig makes one from a printed board{_unread(layout)}"
     )
+
+
+def _unread(layout: Layout) -> str:
+    """Return which files of a recording may be calibrations of forms that are not read, for a
+    message.
+    """
+    files = sorted({*layout.root.iterdir(), *layout.base.iterdir()})
+    names = [
+        file.name
+        for file in files
+        if file.suffix.lower() in _OF_CALIBRATIONS and not file.name.startswith(_NO_CALIBRATION)
+    ]
+    if not names:
+        return ""
+    return f"; of no form that is read: {', '.join(names[:_NAMED])}"
 
 
 def is_pair_of_eth3d(layout: Layout) -> bool:

@@ -41,7 +41,8 @@ _NUMBER = r"\d+(?:\.\d*)?(?:[eE][+-]?\d+)?"
 # `1700000001.33713`, `17000000013371ms`, `000012_1403636579763555584`, with the number of the frame, and
 # `1403636579_763555584`, seconds and nanoseconds
 _STAMP = re.compile(
-    r"(?:(?:[A-Za-z]+\d?(?:[_-][A-Za-z]+\d?)*|(?P<number>\d{1,7}))[_-])?"
+    # words, a number of theirs, or the frame's
+    r"(?:(?:[A-Za-z]+\d?(?:[_-][A-Za-z]+\d?)*(?:[_-]\d{1,7})?|(?P<number>\d{1,7}))[_-])?"
     r"(?P<time>\d{10,19}|\d{1,10}\.\d{1,9}|1\d{9}[_-]\d{1,9})(?:_?(?P<unit>ns|us|ms|s))?"
     r"(?:[_-][A-Za-z]+\d?)?"
 )

@@ -195,7 +195,12 @@ def _decoded(data: bytes, path: Path | str, *, colour: bool) -> npt.NDArray[Any]
         raise UnreadableImageError(
             f"{path}: does not decode ({' '.join(str(error).split())})"
         ) from error
-    if pixels is None or not pixels.size or pixels.dtype not in (np.uint8, np.uint16):
+    if pixels is not None and pixels.dtype not in (np.uint8, np.uint16):
+        raise UnreadableImageError(
+            f"{path}: its pixels are {pixels.dtype}, and images of 8 or 16 bits are read; write it so, "
+            "all images by one factor"
+        )
+    if pixels is None or not pixels.size:
         raise UnreadableImageError(
             f"{path}: does not decode as an image of 8 or 16 bits; copy the image again"
         )

@@ -13,6 +13,7 @@ named as the images, or in the layout of TUM RGB-D, it is one with depth images 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -35,6 +36,7 @@ from vio.datasets.companions import (
     reference_of_images,
 )
 from vio.datasets.euroc import is_euroc_folder, read_euroc
+from vio.datasets.halves import halves_note
 from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import (
     ImageDataset,
@@ -443,8 +445,9 @@ def read_mono(path: Path, settings: DatasetSettings) -> ImageDataset:
             "left/"
         )
     files = list_images(layout.left)
-    doubt = alternating_note(len(files), lambda k: load_gray(files[k])[0])
-    notes = (*_empty_partner_note(layout), *((doubt,) if doubt is not None else ()))
+    load = lambda k: load_gray(files[k])[0]  # noqa: E731
+    doubts = (alternating_note(len(files), load), halves_note(len(files), load))
+    notes = (*_empty_partner_note(layout), *filter(None, doubts))
     images = _Images(FilePairs(files, files), notes)
     return _read("mono", layout, images, settings)
 
@@ -502,8 +505,22 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> ImageDataset:
         raise DataError(
             f"{layout.base / 'depth'}: no file is named as one of {layout.left}; name them alike"
         )
+    _check_depths(depth_images[0], files[0])
     depths_of_files = depth_images.take(depth_of[file.stem] for file in files)
     return _read("rgbd", layout, _Images(FilePairs(files, files), depths=depths_of_files), settings)
+
+
+def _check_depths(depth: Path, image: Path) -> None:
+    """Raise DataError where a depth image has 8 bits and the size of the image, as the right ones of a
+    stereo camera have that RTAB-Map writes there.
+    """
+    with contextlib.suppress(UnreadableImageError):
+        pixels, bits = load_gray(depth)
+        if bits == 8 and pixels.shape == load_gray(image)[0].shape:
+            raise DataError(
+                f"{depth}: has 8 bits, too few for depths; where depth/ holds the right images of a "
+                "stereo camera, as RTAB-Map's export does, name the folders left and right"
+            )
 
 
 def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings) -> ImageDataset:

@@ -10,6 +10,7 @@ import re
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Literal
 
@@ -47,7 +48,11 @@ _NANOSECONDS = re.compile(r"n(ano)?secs?$|nanoseconds?$")
 _PLAIN = re.compile(r"[0-9.eE+-]*")  # numbers in these are written as `_NUMBER` says, or are none
 # columns that number the IMUs of a flight controller
 _UNITS_OF_A_LOG = ("i", "instance", "imu_id", "imu", "device_id", "sensor_id")
-_TIME = re.compile(r"time|stamp|sec|\bt\b")  # in a cell of a header in small letters
+_TIME = re.compile(r"time|stamp|sec|\bt\b|tow\b")  # in a cell of a header in small letters
+# ends of names of the parts of a date, in order, and of what may follow them
+_DATE_PARTS = ("year", "month", "day", "hour", "min(?:ute)?", "sec(?:ond)?s?")
+_NANOS = re.compile(r"nano(?:sec(?:ond)?s?)?$|nsecs?$")
+_TICKS_NS = {"sampletimefine": 100_000}  # of clocks that are called by what they count
 # of a time that is counted from another one
 _RELATIVE = re.compile(r"relative|elapsed|delta|offset")
 # of what is no reading, though it is called by one: covariances, rates, biases
@@ -63,6 +68,9 @@ _FINE = 0.1
 _MAX_LATE = 0.05  # share of lines that may have been written late
 _OWN_PLACE = 0.5  # of the usual interval that is free on both sides of such a line
 _WORD = re.compile(r"[A-Za-z_]+\d*")
+_OF_EACH_SENSOR = "write the lines of each sensor into a file of its own, gyro.csv and accel.csv (timestamp, x, y, z)"
+# letters of sensors' names that are those of axes
+_NO_AXIS = re.compile(r"gyr(?:o(?:scope)?)?|velocity")
 _OTHER_UNITS = {"rad/s": "deg/s or mdps", "m/s^2": "g or mg"}  # for messages
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 
@@ -176,8 +184,13 @@ def table_rows(
                 early = f"the last line ends too early ({len(fields)} of {columns} values)"
                 cut.append(f"{path}, line {number}: {early}; left out")
                 return
+            named = next((field for field in fields[1:] if _WORD.fullmatch(field)), None)
+            if named is None or _NUMBER.fullmatch(named):
+                remedy = ""
+            else:
+                remedy = f"; where {named!r} says whose a line is, {_OF_EACH_SENSOR}"
             raise DataError(
-                f"{path}, line {number}: {len(fields)} values instead of {columns} ({form})"
+                f"{path}, line {number}: {len(fields)} values instead of {columns} ({form}){remedy}"
             )
         if not is_data:
             is_data = True
@@ -231,10 +244,7 @@ class _LinesAbove:
         """
         cells = split_cells(text)
         if cells and _WORD.fullmatch(cells[0]) and _are_numbers(cells[1:]):
-            return (
-                f"; line {number}, {text[:40]!r}, begins with a word: write the lines of each sensor "
-                "into a file of its own, gyro.csv and accel.csv (timestamp, x, y, z)"
-            )
+            return f"; line {number}, {text[:40]!r}, begins with a word: {_OF_EACH_SENSOR}"
         if self.header and not text.startswith("#"):
             return (
                 f"; line {number}, {text[:40]!r}, does not begin with a number (decimals need a "
@@ -564,6 +574,8 @@ def _time_first(table: NumberTable) -> NumberTable:
 
     The stamp of a message goes before that of its recording, an absolute time before others.
     """
+    if (parts := _date_columns(table.header)) is not None:
+        return _dated(table, parts)
     times = [k for k, cell in enumerate(table.header) if _TIME.search(cell)]
     if not times:
         return table
@@ -575,7 +587,8 @@ def _time_first(table: NumberTable) -> NumberTable:
         and _SECONDS.search(names[0]) is not None
         and _NANOSECONDS.search(names[1]) is not None
     )
-    if stamp == 0 and not in_parts:
+    tick_ns = _TICKS_NS.get(names[0])
+    if stamp == 0 and not in_parts and tick_ns is None:
         return table
     # their digits, of which numbers keep sixteen
     rows = itertools.islice(table_rows(table.path, len(table.header), _IMU_FORM, []), 1, None)
@@ -585,11 +598,56 @@ def _time_first(table: NumberTable) -> NumberTable:
     if in_parts and all(part.isdigit() for pair in cells for part in pair):
         header = "time [ns]"
         stamps = tuple(str(int(whole) * NS_PER_S + int(part)) for whole, part in cells)
+    elif tick_ns is not None and all(whole.isdigit() for whole in stamps):
+        header = "time [ns]"
+        stamps = tuple(str(int(whole) * tick_ns) for whole in stamps)
     others = [k for k in range(1, len(table.header)) if k != stamp and not (in_parts and k == rest)]
     return replace(
         table,
         header=(header, *(table.header[k] for k in others)),
         stamps=stamps,
+        values=table.values[:, [k - 1 for k in others]],
+    )
+
+
+def _date_columns(header: Sequence[str]) -> list[int] | None:
+    """Return the columns of year, month, day, hour, minute, second and, where there are, nanoseconds;
+    None: the header names no such date.
+    """
+    names = [re.sub(r"[^a-z]", "", cell) for cell in header]
+    found = [
+        [k for k, name in enumerate(names) if re.search(f"{part}$", name)] for part in _DATE_PARTS
+    ]
+    if not all(found):
+        return None
+    nanos = [k for k, name in enumerate(names) if _NANOS.search(name)]
+    return [*(min(columns, key=lambda k: len(names[k])) for columns in found), *nanos[:1]]
+
+
+def _dated(table: NumberTable, parts: Sequence[int]) -> NumberTable:
+    """Return a table whose stamps are the dates of several columns.
+
+    Raises:
+        DataError: a line has no date there.
+    """
+    rows = itertools.islice(table_rows(table.path, len(table.header), _IMU_FORM, []), 1, None)
+    stamps = list[str]()
+    for number, fields in rows:
+        try:
+            year, month, day, hour, minute = (int(fields[k]) for k in parts[:5])
+            whole = np.datetime64(f"{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}", "ns")
+            seconds = Decimal(fields[parts[5]])
+            nanos = int(fields[parts[6]]) if len(parts) > len(_DATE_PARTS) else 0
+        except (ValueError, ArithmeticError) as error:
+            raise DataError(
+                f"{table.path}, line {number}: its columns of year to second hold no date"
+            ) from error
+        stamps.append(str(int(whole.astype(np.int64)) + int(seconds * NS_PER_S) + nanos))
+    others = [k for k in range(1, len(table.header)) if k not in parts]
+    return replace(
+        table,
+        header=("time [ns]", *(table.header[k] for k in others)),
+        stamps=tuple(stamps),
         values=table.values[:, [k - 1 for k in others]],
     )
 
@@ -672,19 +730,20 @@ def _imu_order(table: NumberTable) -> Sequence[int] | None:
 def _sensor_and_axis(cell: str) -> tuple[str, str]:
     """Return the sensor and the axis that a cell of a header names; empty where it names none."""
     letters = re.sub(r"[^a-z]", "", without_unit(cell)).replace("axis", "")
+    of_axis = _NO_AXIS.sub("", letters)
     if _NO_READING.search(letters):
         return "", ""
     indexed = _INDEXED_AXIS.search(cell)
     if indexed is not None:
         return _sensor(letters), dict(zip("012", "xyz", strict=True)).get(indexed[1], indexed[1])
-    axis = next((c for c in reversed(letters) if c in "xyz"), "")
+    axis = next((c for c in reversed(of_axis) if c in "xyz"), "")
     return _sensor(letters), axis
 
 
 def _sensor(letters: str) -> str:
     """Return w for the name of a gyro's column, a for an accelerometer's, else nothing."""
     if re.match(r"w|g(?!rav|ps|nss)|om|ang|rot|rs?sw", letters) or re.search(
-        r"gyr|angularvel|omega", letters
+        r"gyr|ang(?:ular)?(?:vel|rate)|omega", letters
     ):
         return "w"
     return "a" if letters.startswith(("a", "lin")) or "acc" in letters else ""

@@ -138,6 +138,7 @@ _FOREIGN: dict[str, tuple[str, str]] = {
         (".svo", ".svo2"),
         ("a recording of ZED's SDK", "export its left and right images with that SDK"),
     ),
+    ".map": ("a map of vio run", "give the recording; vio map show says what the map holds"),
     ".vrs": ("a VRS file", "extract its images and its IMU (vrs extract-all)"),
     ".ulg": ("a log of PX4", "write its IMU as a table (ulog2csv), named imu.csv"),
     ".db": ("a database, as of RTAB-Map", "export its images and calibration with that program"),

@@ -84,7 +84,7 @@ def _strict_or_lax(text: str) -> Any:
 
 
 def read_json_file(path: Path) -> dict[str, object]:
-    """Read a JSON file that holds one object.
+    """Read a JSON file that holds one object, or a list whose first item is one.
 
     Raises:
         CalibrationError: the file is missing, too large, or no JSON object.
@@ -95,6 +95,8 @@ def read_json_file(path: Path) -> dict[str, object]:
         entries = json.loads("\n".join(line for _, line in text_lines(path)))
     except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path}: not a JSON file ({error}); copy it again") from error
+    if isinstance(entries, list) and entries and isinstance(entries[0], dict):
+        entries = entries[0]  # of cuVSLAM's scenes, which are lists
     if not isinstance(entries, dict):
         raise CalibrationError(f"{path}: holds no calibration (expected a JSON object)")
     return {str(key): value for key, value in entries.items()}

@@ -193,7 +193,14 @@ def evaluate(
         EvaluationError: nothing to compare, different frames without an extrinsic or without an
             alignment, non-finite poses, or an alignment that the data do not determine (the scale
             of a motionless estimate).
+        TypeError: one is no trajectory, such as the path of one.
     """
+    for name, given in (("estimate", estimate), ("reference", reference)):
+        if not isinstance(given, Trajectory):
+            raise TypeError(
+                f"{name}: give a Trajectory, as vio.run(...).trajectory or "
+                f"vio.files.trajectories.read_trajectory(path), not {type(given).__name__}"
+            )
     if align not in get_args(AlignMode):
         raise EvaluationError(
             f"unknown alignment {align!r}; choose one of {', '.join(get_args(AlignMode))}"

@@ -24,6 +24,17 @@ _WHOLE = re.compile(r"(\d{1,19})(?:\.0*)?")
 _SIGNED = re.compile(r"([+-]?\d{1,19})(?:\.0*)?")
 # what else than ASCII files of Windows have in units: ° ² ³ µ · ¹ º
 _LATIN = frozenset("°²³µ·¹º")
+# how files of other kinds begin
+_BINARY = {
+    b"\x93NUMPY": "an array of NumPy",
+    b"PK\x03\x04": "a ZIP archive, as those of NumPy (.npz) and Excel",
+    b"\x89HDF": "HDF5",
+    b"MATLAB": "a file of MATLAB",
+    b"SQLite": "a database, such as a map of vio run or a bag",
+    b"\x1f\x8b": "packed with gzip",
+    b"ply": "a point cloud",
+    b"\x80": "a pickle of Python",
+}
 _PIECE: Capacity[int] = 2**16  # characters that are split into lines at a time
 _ROUNDED = 0.05  # share of times that repeat the one before, as rounded ones do
 
@@ -74,9 +85,9 @@ def _decoded(data: bytes, path: Path) -> str:
         others = {letter for letter in text if not (letter.isascii() and letter >= "\t")}
         if others <= _LATIN:
             return text
-        raise DataError(
-            f"{path}: not a text file ({error.reason}); give the original file"
-        ) from error
+        kind = next((kind for start, kind in _BINARY.items() if data.startswith(start)), None)
+        remedy = "give the original file" if kind is None else f"it is {kind}: write it as text"
+        raise DataError(f"{path}: not a text file ({error.reason}); {remedy}") from error
 
 
 def _split_lines(text: str) -> Iterator[str]:

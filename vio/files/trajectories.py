@@ -20,10 +20,10 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
-from vio.files.pose_columns import PoseColumns, are_geographic, pose_columns
+from vio.files.pose_columns import PoseColumns, are_geographic, named_columns, pose_columns
 from vio.files.stamps import POSE_PACE, parse_stamps
 from vio.files.text import exact_text, lines_of, seconds_text, whole_ns_stamps
-from vio.files.units import header_cells, split_cells, with_decimal_points
+from vio.files.units import split_cells, with_decimal_points
 from vio.geometry.lie import (
     FloatArray,
     nearest_rotation,
@@ -93,6 +93,7 @@ class _Table:
     rows: list[str]
     line_numbers: list[int]  # from 1, one per row
     separator: str | None  # of the fields of the first row; None: white space
+    header: str = ""  # the line of names above the data that is no comment; empty: none
 
     @property
     def commas(self) -> bool:
@@ -140,20 +141,18 @@ def read_trajectory(
             f"unknown trajectory format {fmt!r}; choose one of "
             f"{', '.join(get_args(TrajectoryFormat))}"
         )
+    if Path(path).is_dir():
+        raise DataError(f"{path}: is a folder; give a file of poses")
     table = _read_table(Path(path))
     if not table.rows:
         raise DataError(f"{table.path}: holds no poses; give a TUM, KITTI or EuRoC trajectory file")
-    kind = fmt or _detect(table)
-    _check_columns(table, kind, as_requested=fmt is not None)
+    named = _named(table)
+    kind = fmt or _detect(table, named)
+    _check_columns(table, kind, None if fmt is not None else named)
     if kind == "kitti":
         return _matrices(table, body)
-    if are_geographic(table.comments):
-        raise DataError(
-            f"{table.path}: its header names latitude and longitude, which are no metres; give "
-            "positions in metres, as a local frame of east, north and up has them"
-        )
     table = _without_repeats(table)
-    columns = pose_columns(table.comments, len(table.fields(0)), w_first=kind == "euroc")
+    columns = named or _unnamed(table, w_first=kind == "euroc")
     table = _without_lost(table, columns)
     times_ns = _times_ns(table, columns, kind)
     poses, orientations = _quaternion_poses(table, columns, kind)
@@ -165,6 +164,31 @@ def read_trajectory(
         poses, times_ns, _body(table, header_body, body) or _DEFAULT_BODY[kind], numbers
     )
     return _with_orientations(table, trajectory, orientations, columns.orientations)
+
+
+def _named(table: _Table) -> PoseColumns | None:
+    """Return the columns that a header names; None: none names those of a pose.
+
+    Raises:
+        DataError: a header states what are no poses.
+    """
+    count = len(table.fields(0))
+    if count < _MIN_COLUMNS:
+        return None
+    try:
+        return named_columns(table.comments, count, w_first=table.commas)
+    except DataError as error:
+        raise DataError(f"{table.path}: {error}") from error
+
+
+def _unnamed(table: _Table, *, w_first: bool) -> PoseColumns:
+    """Return the columns of a table whose header does not name them."""
+    if are_geographic(table.comments):
+        raise DataError(
+            f"{table.path}: its header names latitude and longitude, which are no metres; give "
+            "positions in metres, as a local frame of east, north and up has them"
+        )
+    return pose_columns(table.comments, len(table.fields(0)), w_first=w_first)
 
 
 def _without_repeats(table: _Table) -> _Table:
@@ -422,12 +446,14 @@ def _read_table(path: Path) -> _Table:
     comments: list[str] = []
     rows: list[str] = []
     line_numbers: list[int] = []
+    header = ""
     for number, text in lines_of(path):
         line = text.strip()
         if line[:1] in ("#", "%"):
             comments.append(line[1:].strip())
         elif line and not rows and _is_header(line):
             comments.append(line)
+            header = line
         elif line:
             rows.append(line.rstrip(",;").rstrip())
             line_numbers.append(number)
@@ -435,12 +461,32 @@ def _read_table(path: Path) -> _Table:
     cells = split_cells(first)
     if "," in first and re.search(r"[;\t]", first) and all(map(_is_number, cells)):
         rows = [";".join(split_cells(row)) for row in rows]  # decimal commas
-        return _Table(path, comments, rows, line_numbers, ";")
+        return _Table(path, comments, rows, line_numbers, ";", header)
     if with_decimal_points(first) is not None:
         rows = [with_decimal_points(row) or row for row in rows]
         first = rows[0]
     separator = "," if "," in first else ";" if ";" in first else None
-    return _Table(path, comments, rows, line_numbers, separator)
+    _check_poses(path, comments, first)
+    return _Table(path, comments, rows, line_numbers, separator, header)
+
+
+def _check_poses(path: Path, comments: Sequence[str], first: str) -> None:
+    """Raise DataError for poses of other programs that are no table of them.
+
+    Args:
+        path: the file.
+        comments: its comments and headers.
+        first: its first row.
+    """
+    if any("IMAGE_ID" in comment and "QW" in comment for comment in comments):
+        what = "is a model of COLMAP, whose poses map the world to each camera and have no times"
+    elif re.match(r"[{\[]", first):
+        what = "is JSON"
+    elif re.match(r"Format Version,|Objects\b|Trajectories\b", "\n".join((*comments[:1], first))):
+        what = "is an export of Motive or Vicon, which names its columns in several lines"
+    else:
+        return
+    raise DataError(f"{path}: {what}; write a table of {_COLUMNS['tum']}, in metres")
 
 
 def _is_header(line: str) -> bool:
@@ -457,42 +503,42 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _detect(table: _Table) -> TrajectoryFormat:
-    """Detect the format from the first row, and from a header that names more columns."""
+def _detect(table: _Table, named: PoseColumns | None) -> TrajectoryFormat:
+    """Detect the format from the first row, and from the columns that a header names."""
     if table.commas:
         return "euroc"
     n = len(table.fields(0))
-    named = _names_poses(table, n)
     kitti = n in _MATRIX_COLUMNS
     if _GRAPH.match(table.rows[0]):
         raise DataError(
             f"{table.path}: is a graph of poses (g2o, TORO), which have no times; write them as "
             f"TUM form, {_COLUMNS['tum']}"
         )
-    if n not in (_MIN_COLUMNS, _POSE_COLUMNS) and not (named or kitti):
+    if n not in (_MIN_COLUMNS, _POSE_COLUMNS) and named is None and not kitti:
         forms = "; ".join(f"{kind}: {columns}" for kind, columns in _COLUMNS.items())
-        table.fail(0, f"{n} columns fit no known format ({forms})")
-    return "kitti" if kitti and not named else "tum"
+        table.fail(0, f"{n} columns fit no known format ({forms}){_without_times(n)}")
+    return "kitti" if kitti and named is None else "tum"
 
 
-def _names_poses(table: _Table, count: int) -> bool:
-    """Return whether a header names the columns of positions and quaternions."""
-    if count < _POSE_COLUMNS:
-        return False
-    named = [text for text in table.comments if header_cells(text, count)]
-    return bool(named) and pose_columns(named, count, w_first=False).orientations == "stated"
+def _without_times(count: int) -> str:
+    """Return what a number of columns without a header may be, for a message."""
+    if count != _POSE_COLUMNS - 1:
+        return ""
+    return (
+        "; a position and a quaternion lack the time in front, and angles in place of a quaternion are "
+        "not read: give the first four columns alone"
+    )
 
 
-def _check_columns(table: _Table, kind: TrajectoryFormat, *, as_requested: bool) -> None:
+def _check_columns(table: _Table, kind: TrajectoryFormat, named: PoseColumns | None) -> None:
+    """Check that each row has the columns of its form, or as many as a header names."""
     count = len(table.fields(0))
     expected = {"tum": _POSE_COLUMNS, "kitti": _KITTI_COLUMNS, "euroc": max(count, _POSE_COLUMNS)}[
         kind
     ]
     if kind == "kitti" and count in _MATRIX_COLUMNS:
         expected = count
-    if kind != "kitti" and (
-        count == _MIN_COLUMNS or (not as_requested and _names_poses(table, count))
-    ):
+    if kind != "kitti" and (count == _MIN_COLUMNS or named is not None):
         expected = count
     for row, line in enumerate(table.rows):
         separator = table.separator
@@ -502,8 +548,18 @@ def _check_columns(table: _Table, kind: TrajectoryFormat, *, as_requested: bool)
             count = line.count(separator) + 1
         if count != expected:
             table.fail(
-                row, f"{count} columns instead of {expected}; {kind} form has {_COLUMNS[kind]}"
+                row,
+                f"{count} columns instead of {expected}; {kind} form has {_COLUMNS[kind]}"
+                f"{_other_names(table) or _without_times(count)}",
             )
+
+
+def _other_names(table: _Table) -> str:
+    """Return that a header names no pose, for a message; empty: there is none."""
+    names = split_cells(table.header)
+    if not names:
+        return ""
+    return f"; its header ({', '.join(names[:4])}, …) names no pose: give a table of poses"
 
 
 def _floats(table: _Table, columns: Sequence[int], *, finite: bool = True) -> FloatArray:
@@ -535,7 +591,7 @@ def _quaternion_poses(
 
     Those without one (a quaternion of zeros, or of NaN in all poses) have the identity's.
     """
-    p = _floats(table, columns.position)
+    p = columns.to_metres * _floats(table, columns.position)
     if columns.quaternion is None:
         return se3_from_parts(np.eye(3), p), np.zeros(len(p), dtype=np.bool_)
     q_xyzw = _floats(table, columns.quaternion, finite=False)
@@ -567,7 +623,7 @@ def _quaternion_poses(
         table.fail(
             row,
             f"the quaternion has norm {norm[row]:.6g}, not 1; check the column order "
-            f"({_COLUMNS[kind]})",
+            f"({_COLUMNS[kind]}){'' if columns.orientations == 'stated' else _other_names(table)}",
         )
     return se3_from_parts(rotation_from_quat_xyzw(q_xyzw), p), known
 

@@ -7,7 +7,7 @@ A unit stands in brackets (`wx [deg/s]`), behind the last `_`, `-`, `.`, `:` or 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
@@ -38,6 +38,14 @@ ACCEL_UNITS: Mapping[str, float] = {
     **dict.fromkeys(("mg", "millig", "milli_g", "milli-g"), 1e-3 * _GRAVITY),
     **dict.fromkeys(("cm/s2", "cm_s2", "cmps2", "cms2", "gal"), 1e-2),
     **dict.fromkeys(("mm/s2", "mm_s2", "mmps2", "mms2"), 1e-3),
+}
+_OF_READINGS = frozenset((*GYRO_UNITS, *ACCEL_UNITS))
+# Factors to metres.
+LENGTH_UNITS: Mapping[str, float] = {
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
+    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 1e-2),
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1e-3),
+    **dict.fromkeys(("km", "kilometer", "kilometers", "kilometre", "kilometres"), 1e3),
 }
 _BRACKETS = re.compile(r"[\[({<]\s*((?:[^\[\](){}<>]|[({][^(){}]*[)}])*?)\s*[\])}>]")
 # a number with a decimal comma, or with no decimals
@@ -169,12 +177,17 @@ def unknown_unit(cell: str, units: Mapping[str, float]) -> str | None:
     return unknown[0] if unknown else None
 
 
-def without_unit(cell: str) -> str:
-    """Return the name of a column without the unit that it states, in lower case."""
+def without_unit(cell: str, units: Collection[str] = _OF_READINGS) -> str:
+    """Return the name of a column without the unit that it states, in lower case.
+
+    Args:
+        cell: of a header.
+        units: what may stand behind the name.
+    """
     text = _BRACKETS.sub("", cell.lower()).strip()
     for candidate in _tails(text):
         word = _plain(candidate)
-        if word in GYRO_UNITS or word in ACCEL_UNITS:
+        if word in units:
             name = text[: len(text) - len(candidate)].rstrip("_-.:/ ")
             if name:
                 return name

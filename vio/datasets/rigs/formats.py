@@ -28,10 +28,12 @@ from vio.datasets.rigs import (
     boofcv,
     camodocal,
     depthai,
+    edex,
     eth3d,
     monado,
     okvis,
     orbslam,
+    spectacular,
     zed,
 )
 from vio.datasets.rigs.boofcv import is_boofcv, read_boofcv
@@ -62,16 +64,25 @@ Size = tuple[int, int]
 KNOWN = (
     "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt "
     "or calib_cam_to_cam.txt, OpenCV's stereo .yml or .xml (M1 D1 M2 D2 R T), ROS's left.yaml and "
-    "right.yaml, or BoofCV's stereo.xml; or the settings of ORB-SLAM, VINS, OKVIS, Kimera or SVO, "
-    "Basalt's, Monado's or DepthAI's JSON, or a ZED's SN*.conf"
+    "right.yaml, or BoofCV's stereo.xml; or the settings of ORB-SLAM, stella_vslam, VINS, OKVIS, Kimera or SVO, "
+    "Basalt's, Monado's, DepthAI's or Spectacular AI's JSON, cuVSLAM's EDEX, or a ZED's SN*.conf"
 )
-_OTHERS = (".yaml", ".yml", ".json", ".xml", ".conf")  # whose content decides in any folder
+_OTHERS = (
+    ".yaml",
+    ".yml",
+    ".json",
+    ".xml",
+    ".conf",
+    edex.SUFFIX,
+)  # whose content decides in any folder
 _MAX_OTHERS = 40  # files looked into; a folder with more is no recording's
 # whether entries are of a format, and what reads it; the first that fits does
 _FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] = (
     (is_camchain, lambda source: read_camchain(source.path, alone=source.cameras == 1)),
     (camodocal.matches, camodocal.read),
     (monado.matches, monado.read),
+    (edex.matches, edex.read),
+    (spectacular.matches, spectacular.read),
     (okvis.matches, okvis.read),
     (orbslam.matches, orbslam.read),
     (boofcv.matches, boofcv.read),
@@ -167,11 +178,11 @@ def _is_of_one_camera(file: Path) -> bool:
 def _entries(path: Path) -> Entries:
     """Return what a file holds, by its suffix."""
     suffix = path.suffix.lower()
-    if suffix == ".json":
+    if suffix in (".json", edex.SUFFIX):
         return read_json_file(path)
     if suffix == ".npz":
         return read_arrays(path)
-    if suffix == ".conf":
+    if suffix == ".conf" and not path.read_bytes().startswith(b"%YAML"):
         return zed.read_conf(path)
     if suffix == ".xml":
         return {} if is_boofcv(path) else read_entries(path)

@@ -1,4 +1,5 @@
-"""Settings of ORB-SLAM2 and ORB-SLAM3, which are OpenCV's YAML, in their old and new form.
+"""Settings of ORB-SLAM2 and ORB-SLAM3, which are OpenCV's YAML, in their old and new form, and those
+of OpenVSLAM and stella_vslam.
 
 Old: `Camera.fx … Camera.bf`, `Camera2.fx …` with `Tlr`, or `LEFT.K … RIGHT.P`; `Tbc`. New
 (`File.version`): `Camera1.fx …`, `Camera2.fx …`, `Stereo.T_c1_c2` or `Stereo.b`; `IMU.T_b_c1`.
@@ -6,7 +7,11 @@ Old: `Camera.fx … Camera.bf`, `Camera2.fx …` with `Tlr`, or `LEFT.K … RIGH
 `Tlr` and `Stereo.T_c1_c2` map coordinates of the right camera to the left one, `Tbc` and
 `IMU.T_b_c1` those of the left camera to the IMU; metres. `Camera.bf` is focal length times
 baseline, pixels times metres. Neither form has a time shift. Noise: densities in SI units.
-Reference: ORB-SLAM3's `Settings.cc` and `Tracking.cc`, and its document Calibration_Tutorial.
+OpenVSLAM names it `Camera.focal_x_baseline`, the size `Camera.cols` and `Camera.rows`, and the lens
+`Camera.model`; stella_vslam has them in a block `Camera:`, and raw images where there is a block
+`StereoRectifier:`.
+Reference: ORB-SLAM3's `Settings.cc` and `Tracking.cc`, and its document Calibration_Tutorial;
+stella_vslam's documentation, Parameters.
 """
 
 from __future__ import annotations
@@ -28,12 +33,20 @@ from vio.records import ImuDensities
 
 _NOISE = ("IMU.NoiseGyro", "IMU.GyroWalk", "IMU.NoiseAcc", "IMU.AccWalk")
 _POSES_OF_CAMERA = ("IMU.T_b_c1", "Tbc")
+# names of OpenVSLAM, and ORB-SLAM's
+_OF_STELLA = {
+    "Camera.cols": "Camera.width",
+    "Camera.rows": "Camera.height",
+    "Camera.focal_x_baseline": "Camera.bf",
+}
+_LENSES_OF_STELLA = {"perspective": "PinHole", "fisheye": "KannalaBrandt8"}
 _SAME_BASELINE = 0.02  # share by which rounded numbers may differ
 _POSES_OF_RIGHT = ("Stereo.T_c1_c2", "Tlr")
 
 
 def matches(entries: Entries) -> bool:
     """Return whether entries are settings of ORB-SLAM with a camera."""
+    entries = _in_its_names(entries)
     return any(key in entries for key in ("Camera.fx", "Camera1.fx", "LEFT.K"))
 
 
@@ -43,12 +56,48 @@ def read(source: Source) -> Rig:
     Raises:
         CalibrationError: an entry is missing or impossible, or the image size is not known.
     """
+    entries = _in_its_names(source.entries)
+    source = replace(source, entries=entries)
     rig = _cameras(source)
-    entries = source.entries
     pose = _transform(entries, _POSES_OF_CAMERA, source.where)
     T_cam0_imu = None if pose is None else se3_inverse(pose)
     noise = None if pose is None else _noise(entries, source.where)
     return noting_imu_place(replace(rig, T_cam0_imu=T_cam0_imu, imu_noise=noise), source.where)
+
+
+def _in_its_names(entries: Entries) -> Entries:
+    """Return entries of OpenVSLAM or stella_vslam by ORB-SLAM's names; others as they are."""
+    named = dict(entries)
+    block = entries.get("Camera")
+    if isinstance(block, dict):
+        named |= {f"Camera.{key}": value for key, value in block.items()}
+    if "Camera.model" not in named:
+        return entries
+    for key, name in _OF_STELLA.items():
+        if key in named:
+            named.setdefault(name, named[key])
+    model = str(named["Camera.model"]).lower()
+    named["Camera.type"] = _LENSES_OF_STELLA.get(model, model)
+    rectifier = entries.get("StereoRectifier")
+    if isinstance(rectifier, dict) and "K_left" in rectifier:
+        size = {"width": named.get("Camera.width"), "height": named.get("Camera.height")}
+        fisheye = str(rectifier.get("model", model)).lower() == "fisheye"
+        lens = {"distortion_model": "equidistant"} if fisheye else {}
+        fx, fy, cx, cy, bf = (
+            as_number(named.get(f"Camera.{key}")) for key in ("fx", "fy", "cx", "cy", "bf")
+        )
+        rows = [[fx, 0.0, cx, 0.0], [0.0, fy, cy, 0.0], [0.0, 0.0, 1.0, 0.0]]
+        return {
+            **{f"LEFT.{key}": rectifier.get(f"{key}_left") for key in "KDR"},
+            **{f"RIGHT.{key}": rectifier.get(f"{key}_right") for key in "KDR"},
+            **{f"LEFT.{key}": value for key, value in size.items()},
+            **lens,
+            "LEFT.P": rows,
+            "RIGHT.P": [[fx, 0.0, cx, -bf], *rows[1:]],
+            "Camera.fx": fx,
+            "Camera.bf": bf,
+        }
+    return named
 
 
 def _cameras(source: Source) -> Rig:
