@@ -19,6 +19,7 @@ from vio.guard.repairing import AS_READ
 from vio.imu.findings import ImuVerdict
 from vio.imu.settings import DEFAULT_IMU
 from vio.monitor.contradiction import ImuContradiction
+from vio.monitor.frame_order import FrameOrder
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RefusalReport, RunHealth, is_corrected
 from vio.monitor.image_geometry import ImageGeometry
@@ -69,6 +70,7 @@ class RunMonitor:
         self._health = RunHealth()
         self._refusals = RefusalReport(imu=imu)
         self._views = ViewChange()
+        self._order = FrameOrder()
         self._geometry = ImageGeometry(camera)
         self._misfit = TrackMisfit()
         from vio.guard.two_motions import TwoMotions  # loads OpenCV
@@ -161,7 +163,11 @@ class RunMonitor:
         repeated = self._frozen.check(frame, expected)
         self._repeated = repeated is not None
         named = repeated if repeated is not None and repeated.certain else None
-        self._report("frames-repeated", self._repeats.frame(frame, named))
+        since = None if named is None else named.since
+        self._add(
+            Finding("frames-repeated", line, frame.index, since)
+            for line in self._repeats.frame(frame, named)
+        )
         return self._repeated
 
     def without_repeated_depth(self, frame: StereoFrame) -> StereoFrame:
@@ -374,6 +380,7 @@ class RunMonitor:
         """
         self._integrity.take_scale(measured=has_scale)
         self._add(self._health.frame(index, report, estimate))
+        self._add(self._order.frame(index, estimate.T_world_imu[:3, 3]))
         if self._contradiction is not None:
             self._add(self._contradiction.frame(index, report.innovation_ratio))
             self._integrity.take_innovation(report.innovation_ratio)
