@@ -183,6 +183,17 @@ class FrozenImages:
             return 0.0
         return _median_flow_px(self._seen_before, self._seen)
 
+    @property
+    def flow_px(self) -> float | None:
+        """Median flow of the features of the present frame; None: the last two share too few."""
+        if self._seen is None or self._seen_before is None:
+            return None
+        return (
+            self._flows[-1]
+            if min(len(self._seen), len(self._seen_before)) >= _FLOW.min_corners
+            else None
+        )
+
     def take_held(self) -> int | None:
         """Return the first of the equal frames that were taken for a rig at standstill, and were
         not, as the present frame shows; None: there are none.

@@ -26,9 +26,11 @@ from vio.monitor.image_geometry import ImageGeometry
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import IntegrityMonitor, Mark
 from vio.monitor.misfit import TrackMisfit
+from vio.monitor.still_features import StillFeatures
 from vio.monitor.view_change import ViewChange
 from vio.records import (
     Estimate,
+    Image,
     ImuSample,
     MotionSample,
     Observations,
@@ -71,6 +73,8 @@ class RunMonitor:
         self._refusals = RefusalReport(imu=imu)
         self._views = ViewChange()
         self._order = FrameOrder()
+        self._still = StillFeatures()
+        self._image: Image | None = None  # left one of the present frame
         self._geometry = ImageGeometry(camera)
         self._misfit = TrackMisfit()
         from vio.guard.two_motions import TwoMotions  # loads OpenCV
@@ -159,6 +163,7 @@ class RunMonitor:
         Frames come in time order, each with the back end's prediction of it.
         """
         self._index, self._index_before = frame.index, self._index
+        self._image = frame.left
         self._take_new(frame.index, frame.time_ns)
         repeated = self._frozen.check(frame, expected)
         self._repeated = repeated is not None
@@ -395,6 +400,8 @@ class RunMonitor:
             self._add(self._views.frame(self._seen, ratio, measured=measured, imu=imu))
             self._add(self._geometry.frame(self._seen, ratio))
             self._add(self._refusals.frame(self._seen, report, estimate))
+            flow_px = None if measured else self._frozen.flow_px
+            self._add(self._still.frame(index, self._image, flow_px))
             misfit = None if measured else report.misfit
             self._add(self._misfit.frame(self._seen, misfit, self._motions.frame(self._seen)))
         self._scale_lines += self._health.scale(index, estimate)
