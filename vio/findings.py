@@ -107,7 +107,7 @@ CODES: dict[str, Code] = {
     ),
     "rolling-shutter": Code(
         "unusable",
-        "rows are exposed one after the other; from then on features are moved to one time",
+        "rows are exposed one after the other; features are moved to one time",
         "set frontend.readout_ms",
     ),
     "readout-contradicted": Code(
@@ -122,7 +122,7 @@ CODES: dict[str, Code] = {
     ),
     "images-exchanged": Code(
         "degraded",
-        "left and right images are exchanged for a while; they are put back, or left out",
+        "left and right images are exchanged; they are put back, or left out",
         "check how the two streams are told apart",
     ),
     "right-image-frozen": Code(
@@ -151,12 +151,12 @@ CODES: dict[str, Code] = {
     ),
     "right-camera-turned": Code(
         "degraded",
-        "the right camera is turned, or has turned, in its mount; that is taken out",
+        "the right camera is turned in its mount; that is taken out",
         "fix the mount of the right camera, and calibrate anew",
     ),
     "right-camera-shakes": Code(
         "degraded",
-        "all disparities of a frame are off together, by another amount in each; they count less",
+        "all disparities of a frame are off together, differently in each; they count less",
         "fix the mount of the right camera, or synchronise the cameras",
     ),
     "right-image-late": Code(
@@ -187,7 +187,7 @@ CODES: dict[str, Code] = {
     ),
     "object-covers-image": Code(
         "degraded",
-        "points that move together, but not as the camera does, cover much of the image",
+        "points that move otherwise than the scene cover much of the image",
         "mask what moves with the rig (frontend.klt.mask)",
     ),
     "object-or-scene": Code(
@@ -200,6 +200,9 @@ CODES: dict[str, Code] = {
     ),
     "frame-refused": Code("degraded", "the front end refused a frame", "see the message"),
     "frames-missing": Code("degraded", "no frame came for some time", _CAMERA),
+    "frames-out-of-order": Code(
+        "unusable", "images are not in the order of their exposures", "order them by stamps"
+    ),
     "frames-repeated": Code("degraded", "frames or rows show an earlier exposure again", _CAMERA),
     "images-held": Code(
         "unusable",

@@ -19,6 +19,7 @@ from tests.frontend.test_frontend_scene import CAMERA
 from tools.faults import CAMERAS, GROUPS, HEALTHY, IMU
 from tools.faults import __main__ as command
 from tools.faults.__main__ import FIGURES, PAGE, RUNS, tasks
+from tools.faults.cameras import reordered
 from tools.faults.changes import Changed, Period
 from tools.faults.page import page
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
@@ -101,6 +102,20 @@ def test_a_part_of_a_variant_with_fewer_frames_has_all_of_its_frames(group: str,
     stop = len(changed.recording.frame_times_ns) - 1
     found = [e.index for e in changed.events(1, stop) if isinstance(e, StereoFrame)]
     assert found == list(range(1, stop))
+
+
+def test_images_out_of_order_keep_the_stamps_and_numbers_of_their_places() -> None:
+    flight = _Sorted()
+    changed = list(reordered(3)(flight, PERIOD).events())
+    assert [event.time_ns for event in changed] == [event.time_ns for event in _events()]
+    frames = [event for event in changed if isinstance(event, StereoFrame)]
+    held = [event for event in _events() if isinstance(event, StereoFrame)]
+    # the period begins with frame 8
+    shown = [*range(8), 10, 9, 8, 13, 12, 11, 16, 15, 14, 19, 18, 17]
+    assert [frame.index for frame in frames] == list(range(FRAMES))
+    for frame, of in zip(frames, shown, strict=True):
+        np.testing.assert_array_equal(frame.left, held[of].left)
+        np.testing.assert_array_equal(frame.right, held[of].right)
 
 
 def test_a_part_of_the_reversed_recording_is_that_of_the_whole() -> None:

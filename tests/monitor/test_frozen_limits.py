@@ -73,15 +73,15 @@ def _held(moved_px: float, before_px: float = 0.0, lost: float = 0.0) -> bool:
     return frozen.take_held() is not None
 
 
-def _twice(flow_px: float, rest_px: float = 0.0, frames: int = 13) -> bool:
-    """Whether the last of some frames repeats the one before, where every second one moves by so
-    much, and the others hardly.
+def _twice(flow_px: float, rest_px: float = 0.0, frames: int = 13, period: int = 2) -> bool:
+    """Whether the last of some frames repeats the one before, where the first one of each period
+    hardly moves, and the others do by so much.
     """
     frozen = FrozenImages()
     at = 0.0
     repeated = None
     for k in range(frames):
-        at += flow_px if k % 2 else rest_px
+        at += rest_px if k % period == 0 else flow_px
         left = _noisy(_shifted(LEFT, at), 2 * k)
         right = _noisy(_shifted(RIGHT, at), 2 * k + 1)
         repeated = frozen.check(_frame(k, left, right), _expected(0.0))
@@ -105,7 +105,9 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "predictions are off": (lambda x: not _nearly_equal(off_px=x), 0.43, 0.57),
     "twice: moved": (_twice, 0.28, 0.32),
     "twice: unmoved": (lambda x: not _twice(1.0, x), 0.1, 0.2),
-    "twice: frames": (lambda x: _twice(1.0, frames=round(x)), 11, 13),
+    "twice: frames": (lambda x: _twice(1.0, frames=round(x)), 7, 9),
+    "every third one twice": (lambda x: _twice(x, period=3), 0.28, 0.32),
+    "every fourth one twice": (lambda x: _twice(1.0, frames=round(x), period=4), 9, 13),
     "unmoved": (lambda x: not _nearly_equal(moved_px=x), 0.11, 0.2),
     "unmoved: share": (lambda x: not _partly_moved(x), 0.1, 0.35),
     "unmoved: features": (lambda n: _nearly_equal(features=int(n)), 14, 15),

@@ -246,16 +246,61 @@ def shaking_right(dataset: Dataset, period: Period, degrees: float) -> PairChang
     return shaken
 
 
-def repeated_pairs(dataset: Dataset, period: Period, every: int = 10) -> PairChange:
-    """Every pair of some number is that of the frame before."""
+def repeated_pairs(
+    dataset: Dataset, period: Period, every: int = 10, noise: float = 0.0
+) -> PairChange:
+    """Every pair of some number is that of the frame before, with new noise in gray levels."""
     last: list[Pair] = []
+    rng = np.random.default_rng(1)
 
     def repeated(frame: StereoFrame, *pair: Image) -> Pair:
         if frame.index % every != 0 or not last:
             last[:] = [(pair[0], pair[1])]
-        return last[0]
+            return last[0]
+        if noise == 0.0:
+            return last[0]
+        left, right = (to_gray(image + rng.normal(0.0, noise, image.shape)) for image in last[0])
+        return left, right
 
     return repeated
+
+
+def reordered(count: int) -> Variant:
+    """In each block of so many frames from the fault's begin on, the images come in the opposite
+    order.
+    """
+
+    def variant(dataset: Dataset, period: Period) -> Changed:
+        def changed(events: Iterable[Event]) -> Iterator[Event]:
+            block: list[Event] = []
+            frames: list[int] = []  # where they are in the block
+            for event in events:
+                if not (isinstance(event, StereoFrame) and event.time_ns >= period.begin_ns):
+                    block.append(event)
+                    continue
+                frames.append(len(block))
+                block.append(event)
+                if len(frames) == count:
+                    yield from _backwards(block, frames)
+                    block.clear()
+                    frames.clear()
+            yield from block
+
+        return with_events(dataset, changed)
+
+    return variant
+
+
+def _backwards(block: list[Event], frames: list[int]) -> list[Event]:
+    """Events, of which some are frames, with the images of these in the opposite order."""
+    out = list(block)
+    for to, of in zip(frames, reversed(frames), strict=True):
+        frame = block[to]
+        shown = block[of]
+        assert isinstance(frame, StereoFrame)
+        assert isinstance(shown, StereoFrame)
+        out[to] = replace(frame, left=shown.left, right=shown.right)
+    return out
 
 
 def wrong_calibration(**factors: float) -> Variant:

@@ -16,6 +16,7 @@ from tools.faults.cameras import (
     frozen_images,
     late_images,
     moving_object,
+    reordered,
     repeated_pairs,
     shaking_right,
     torn_images,
@@ -225,6 +226,14 @@ def _repeated(size: float, rng: np.random.Generator) -> Variant:
     return pairs(repeated_pairs, round(size))
 
 
+def _repeated_noisily(size: float, rng: np.random.Generator) -> Variant:
+    return pairs(repeated_pairs, round(size), 1.0)
+
+
+def _reordered(size: float, rng: np.random.Generator) -> Variant:
+    return reordered(round(size))
+
+
 def _constant(variant: Variant) -> Make:
     return lambda size, rng: variant
 
@@ -399,6 +408,8 @@ KINDS: dict[str, Kind] = {
     "mirror": Kind("cameras", "always", 0.2, 0.6, "of the width", _mirror),
     "zoom": Kind("cameras", "onwards", 0.5, 3.0, "%", _zoom),
     "rescaled": Kind("cameras", "onwards", 1.0, 10.0, "%", _rescaled),
+    "repeated, noisy": Kind("cameras", "always", 2, 4, "frames", _repeated_noisily),
+    "out of order": Kind("cameras", "onwards", 2, 4, "frames", _reordered),
 }
 # Every second kind is kept aside: the two of a similar pair come to different halves.
 HALVES: dict[str, Half] = {

@@ -7,8 +7,8 @@ stopped at once. By images alone, a rig that crept and did not slow down may hav
 frames are left out, and nothing is said of them. Nearly equal
 pairs (encoded again, or with noise on top) are the same where the tracked corners have not moved,
 while the motion predicted since the last frame moves them by more than its uncertainty allows and
-the IMU is not at standstill, or while every second frame has shown no motion. A rig at standstill
-gives nearly equal images, too; there the prediction agrees, and they are used.
+the IMU is not at standstill, or while single frames have shown no motion again and again. A rig at
+standstill gives nearly equal images, too; there the prediction agrees, and they are used.
 """
 
 from __future__ import annotations
@@ -60,9 +60,11 @@ class _FlowRules(NamedTuple):
     unmoved_px: float = 0.15  # the flow of an unmoved corner under noise of a few gray levels
     unmoved_share: float = 0.8  # of the corners that must be unmoved
     first_rows: Capacity[int] = 8  # compared before all others
-    # the newest, of which every second one has moved and the others have not: no rig does that, and
-    # each pair comes twice
+    # The newest, at most and at least, of which so many have not moved, each between two that have:
+    # no rig stops for a frame so often, and those come twice.
     twice_frames: int = 12
+    min_twice_frames: int = 8
+    min_paused: int = 3
 
 
 _FLOW = _FlowRules()
@@ -103,6 +105,7 @@ class Repeated:
     of_index: int  # that frame's number
     exact: bool  # equal to the last bit
     certain: bool = True  # False: a rig that crept and has stopped at once looks the same
+    since: int | None = None  # first frame of others like it, that were used; None: there are none
 
 
 class FrozenImages:
@@ -125,6 +128,7 @@ class FrozenImages:
         self._expected: Prediction | None = None  # of the present frame
         # flow (median) of each frame, in pixels; none where it repeats the one before
         self._flows = deque[float](maxlen=_FLOW.twice_frames)
+        self._flow_indices = deque[int](maxlen=_FLOW.twice_frames)  # of these frames
         # median error of each frame's predicted pixels
         self._errors_px: deque[float] = deque(maxlen=_FLOW.recent_frames)
 
@@ -147,7 +151,7 @@ class FrozenImages:
         self._seen_first = self._seen_before
         before = self._seen_before = self._seen
         self._seen = seen
-        self._flows.append(self._flow_px())
+        self._add_flow(seen.frame_index, self._flow_px())
         if self._ended_still is not None and before is not None and len(before):
             since, before_px = self._ended_still
             begun = self._flows[-1] > max(_BEGUN.min_px, _BEGUN.factor * before_px)
@@ -166,14 +170,29 @@ class FrozenImages:
         if self._repeating is None:
             self._shown = frame
         else:
-            self._flows.append(0.0)
+            self._add_flow(frame.index, 0.0)
         return self._repeating
+
+    def _add_flow(self, index: int, flow_px: float) -> None:
+        self._flows.append(flow_px)
+        self._flow_indices.append(index)
 
     def _flow_px(self) -> float:
         """Flow of the features between the two frames before the present one (median)."""
         if self._seen is None or self._seen_before is None:
             return 0.0
         return _median_flow_px(self._seen_before, self._seen)
+
+    @property
+    def flow_px(self) -> float | None:
+        """Median flow of the features of the present frame; None: the last two share too few."""
+        if self._seen is None or self._seen_before is None:
+            return None
+        return (
+            self._flows[-1]
+            if min(len(self._seen), len(self._seen_before)) >= _FLOW.min_corners
+            else None
+        )
 
     def take_held(self) -> int | None:
         """Return the first of the equal frames that were taken for a rig at standstill, and were
@@ -234,19 +253,31 @@ class FrozenImages:
         self._crept = 0
         if self._seen is None or expected is None:
             return None
+        since = self._paused_since()
         is_expected = self._repeating is not None and self._repeating.certain
-        if is_expected or self._comes_twice():
+        if is_expected or since is not None:
             frozen = _unmoved(shown, frame, self._seen)
         else:
             frozen = self._has_stopped(frame, shown, self._seen, expected)
-        return Repeated(shown.index, False) if frozen else None
+        return Repeated(shown.index, False, since=since) if frozen else None
 
-    def _comes_twice(self) -> bool:
-        """Whether every second frame so far has shown no motion, and the last one has."""
-        flows = list(self._flows)
-        if len(flows) < _FLOW.twice_frames:
-            return False
-        return max(flows[0::2]) < _FLOW.unmoved_px and min(flows[1::2]) > _FLOW.moved_px
+    def _paused_since(self) -> int | None:
+        """The first of single frames that have not moved, among others that have, as the last one has;
+        None: there are few, or frames that may be either.
+        """
+        flows = self._flows
+        if len(flows) < _FLOW.min_twice_frames or flows[-1] <= _FLOW.moved_px:
+            return None
+        paused: list[int] = []
+        last_paused = False
+        for index, flow_px in zip(self._flow_indices, flows, strict=True):
+            pauses = flow_px < _FLOW.unmoved_px
+            if (pauses and last_paused) or (not pauses and flow_px <= _FLOW.moved_px):
+                return None
+            if pauses:
+                paused.append(index)
+            last_paused = pauses
+        return paused[0] if len(paused) >= _FLOW.min_paused else None
 
     def _has_stopped(
         self, frame: StereoFrame, shown: StereoFrame, seen: Observations, expected: Prediction

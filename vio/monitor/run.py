@@ -19,15 +19,18 @@ from vio.guard.repairing import AS_READ
 from vio.imu.findings import ImuVerdict
 from vio.imu.settings import DEFAULT_IMU
 from vio.monitor.contradiction import ImuContradiction
+from vio.monitor.frame_order import FrameOrder
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RefusalReport, RunHealth, is_corrected
 from vio.monitor.image_geometry import ImageGeometry
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import IntegrityMonitor, Mark
 from vio.monitor.misfit import TrackMisfit
+from vio.monitor.still_features import StillFeatures
 from vio.monitor.view_change import ViewChange
 from vio.records import (
     Estimate,
+    Image,
     ImuSample,
     MotionSample,
     Observations,
@@ -69,6 +72,9 @@ class RunMonitor:
         self._health = RunHealth()
         self._refusals = RefusalReport(imu=imu)
         self._views = ViewChange()
+        self._order = FrameOrder()
+        self._still = StillFeatures()
+        self._image: Image | None = None  # left one of the present frame
         self._geometry = ImageGeometry(camera)
         self._misfit = TrackMisfit()
         from vio.guard.two_motions import TwoMotions  # loads OpenCV
@@ -157,11 +163,16 @@ class RunMonitor:
         Frames come in time order, each with the back end's prediction of it.
         """
         self._index, self._index_before = frame.index, self._index
+        self._image = frame.left
         self._take_new(frame.index, frame.time_ns)
         repeated = self._frozen.check(frame, expected)
         self._repeated = repeated is not None
         named = repeated if repeated is not None and repeated.certain else None
-        self._report("frames-repeated", self._repeats.frame(frame, named))
+        since = None if named is None else named.since
+        self._add(
+            Finding("frames-repeated", line, frame.index, since)
+            for line in self._repeats.frame(frame, named)
+        )
         return self._repeated
 
     def without_repeated_depth(self, frame: StereoFrame) -> StereoFrame:
@@ -374,6 +385,7 @@ class RunMonitor:
         """
         self._integrity.take_scale(measured=has_scale)
         self._add(self._health.frame(index, report, estimate))
+        self._add(self._order.frame(index, estimate.T_world_imu[:3, 3]))
         if self._contradiction is not None:
             self._add(self._contradiction.frame(index, report.innovation_ratio))
             self._integrity.take_innovation(report.innovation_ratio)
@@ -388,6 +400,8 @@ class RunMonitor:
             self._add(self._views.frame(self._seen, ratio, measured=measured, imu=imu))
             self._add(self._geometry.frame(self._seen, ratio))
             self._add(self._refusals.frame(self._seen, report, estimate))
+            flow_px = None if measured else self._frozen.flow_px
+            self._add(self._still.frame(index, self._image, flow_px))
             misfit = None if measured else report.misfit
             self._add(self._misfit.frame(self._seen, misfit, self._motions.frame(self._seen)))
         self._scale_lines += self._health.scale(index, estimate)
