@@ -18,7 +18,7 @@ from vio.findings import Finding
 from vio.geometry.lie import FloatArray, circledot, length, se3_exp, transform_points
 from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
 from vio.numerics.kinds import Tolerance
-from vio.numerics.robust import median
+from vio.numerics.robust import cauchy_equations
 from vio.records import BoolArray, Observations, shared_rows
 
 
@@ -165,23 +165,18 @@ def _fitted(camera: StereoCamera, p: FloatArray, z: FloatArray) -> _Change | Non
         J[:, :, 7] = off * of_rows
         J[:, :, 8] = of_columns
         J[:, :, 9] = of_rows
-        squared = (r * r).sum(axis=1)
-        usual = max(median(squared), len(center) * _RULES.least_px**2)
-        weight = 1.0 / (1.0 + squared / usual)
-        weighted = (J * weight[:, None, None]).reshape(-1, 10)
-        normal = weighted.T @ J.reshape(-1, 10)
+        equations = cauchy_equations(r, J, _RULES.least_px)
         try:
-            inverse = np.linalg.inv(normal)
+            inverse = np.linalg.inv(equations.matrix)
         except np.linalg.LinAlgError:
             return None
-        step = inverse @ (weighted.T @ r.reshape(-1))
+        step = inverse @ equations.vector
         if not np.isfinite(step).all():
             return None
         T = se3_exp(step[:6]) @ T
         value = value + step[6:]
     # of Cauchy's weights, which half of the features of normal errors have halved
-    variance = 2.0 * float((weight * squared).sum() / (len(center) * weight.sum()))
-    of_change = variance * inverse.diagonal()[6:]
+    of_change = 2.0 * equations.variance * inverse.diagonal()[6:]
     if not (of_change > 0.0).all():
         return None
     off_px = _RULES.disparity_px * length(T[:3, 3]) / camera.baseline_m
