@@ -612,6 +612,7 @@ _SINCE: dict[str, Callable[[Watched], Watched]] = {
     "images are missing": lambda it: _without(it, 60, 25),
     "it is turned": lambda it: _after(it, 3.0, lambda s: replace(s, gyro=_TURNED @ s.gyro)),
     "it has other axes": lambda it: _after(it, 3.0, lambda s: replace(s, gyro=s.gyro[[1, 0, 2]])),
+    "it is in degrees": lambda it: _after(it, 3.0, lambda s: replace(s, gyro=np.degrees(s.gyro))),
     "it is another one": lambda it: _after(it, 3.0, lambda s: replace(s, gyro=-s.gyro[::-1] * 0.7)),
 }
 
@@ -623,6 +624,7 @@ def test_a_gyro_that_has_agreed_at_first_has_no_wrong_units_or_axes(change: str,
     it = _SINCE[change](replace(whole, frames=whole.frames[:130]))
     (found,) = _watch(it)
     assert found.fault == "gyro disagrees"
+    assert found.factor is None
     until = re.search(r"it agrees until (\S+) s after the first frame", found.message)
     assert until is not None
     assert 2.0 < float(until[1]) < 4.0

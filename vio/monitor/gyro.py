@@ -68,7 +68,7 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
         is_none = misfit > _EXCESS.as_none and enough
         is_off = gyro_fit.unexplained > _EXCESS.disagreeing_share and not brief
         if is_off or (is_none and not evidence.clipped):
-            return [_unexplained(_disagreement(gyro_fit), evidence)]
+            return [_or_since(_disagreement(gyro_fit), evidence)]
         return []
     limit = max(
         gyro_fit.tolerance, _EXCESS.clipped_share * evidence.clipped, _EXCESS.brief_share * brief
@@ -78,7 +78,7 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     if gyro_fit.is_chance:
         enough = not brief or (evidence.last and gyro_fit.count >= _EXCESS.min_intervals)
         if enough and not evidence.clipped:
-            return [_unexplained(_disagreement(gyro_fit), evidence)]
+            return [_or_since(_disagreement(gyro_fit), evidence)]
         return []
     if gyro_fit.fits(R):
         return _judge_scale(evidence, R)
@@ -112,7 +112,7 @@ def _name_mistake(evidence: Evidence, unit: float) -> list[InertialFinding]:
         "the gyro's axes have different scales, or images or samples of some time are missing though "
         "the stamps go on",
     )
-    return [_unexplained(finding, evidence)]
+    return [_or_since(finding, evidence)]
 
 
 def _dead(gyro_fit: GyroFit, R: FloatArray, axis: int) -> InertialFinding:
@@ -185,9 +185,9 @@ def backwards(gyro_fit: GyroFit) -> InertialFinding:
     )
 
 
-def _unexplained(finding: InertialFinding, evidence: Evidence) -> InertialFinding:
-    """A finding that no mistake explains: where the gyro has agreed at first, something has
-    happened since.
+def _or_since(finding: InertialFinding, evidence: Evidence) -> InertialFinding:
+    """A finding of readings that are of no use as they are: where they have agreed at first,
+    something has happened since.
     """
     if evidence.record is None:
         return finding
@@ -197,6 +197,7 @@ def _unexplained(finding: InertialFinding, evidence: Evidence) -> InertialFindin
     return replace(
         finding,
         fault="gyro disagrees",
+        factor=None,
         seen=f"{finding.seen}, though it agrees until {until_s:.1f} s after the first frame compared",
         explanation="since then images or samples of some time are missing though the stamps go on, "
         "a clock has jumped, the IMU has turned on the rig, or its driver was started again with "
@@ -227,9 +228,10 @@ def _judge_scale(evidence: Evidence, C: FloatArray) -> list[InertialFinding]:
     if power != 0 and abs(np.log10(scale) - power) < _POWER_OF_TEN:
         odd += f"; or all times, of images and IMU, are {10.0**-power:g} times the true ones (their unit)"
     factor = next((factor for factor in named if abs(np.log(scale / factor)) < 0.15), None)
-    return [
-        InertialFinding("gyro units", seen, odd if factor is None else named[factor], factor=factor)
-    ]
+    if factor is None:
+        return [InertialFinding("gyro units", seen, odd)]
+    finding = InertialFinding("gyro units", seen, named[factor], factor=factor)
+    return [_or_since(finding, evidence)]
 
 
 def _explanations(R: FloatArray, *, gyro_alone: bool) -> Iterator[_Explanation]:
