@@ -182,7 +182,7 @@ def _gyro_says(
         S_cc=I3,
         S_gg=I3,
         is_chance=False,
-        dead_axis=lambda R: None,
+        dead_axes=lambda R: [],
     )
     evidence = _evidence(gyro_fit=fit, clipped=clipped, last=last)
     return [f.fault for f in gyro.judge_gyro(evidence, 1.0) if words is None or words in f.message]

@@ -630,6 +630,25 @@ def test_a_gyro_that_has_agreed_at_first_has_no_wrong_units_or_axes(change: str,
     assert 2.0 < float(until[1]) < 4.0
 
 
+@pytest.mark.parametrize("factor", [0.4, 1.8])
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("name", ["room", "slow"])
+def test_an_axis_of_another_scale_has_not_agreed_at_first(
+    name: str, axis: int, factor: float
+) -> None:
+    it = _recording(name)
+    scales = np.where(np.arange(3) == axis, factor, 1.0)
+    for found in _watch(it, samples=_gyro(it, lambda w: scales * w)):
+        assert "it agrees until" not in found.message
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_gyro_of_one_axis_is_named(axis: int) -> None:
+    it = _recording("room")
+    found = _watch(it, samples=_gyro(it, lambda w: np.where(np.arange(3) == axis, w, 0.0)))
+    assert found[0].is_disabling
+
+
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize(("name", "mount"), [("room", "euroc"), ("slow", "forward")])
 def test_a_dead_axis_of_a_gyro_is_named(name: str, mount: str, axis: int) -> None:

@@ -54,9 +54,9 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     gyro_fit = evidence.gyro_fit
     R = evidence.R_cam0_imu
     brief = evidence.brief
-    axis = gyro_fit.dead_axis(R)
-    if axis is not None and not evidence.clipped:
-        return [_dead(gyro_fit, R, axis)]
+    dead = gyro_fit.dead_axes(R)
+    if dead and not evidence.clipped:
+        return [_dead(gyro_fit, R, dead)]
     if evidence.turn is not None:
         C = so3_exp(evidence.turn.rotation) @ R
         return [turned_finding(evidence.turn, R), *_judge_scale(evidence, C)]
@@ -115,17 +115,18 @@ def _name_mistake(evidence: Evidence, unit: float) -> list[InertialFinding]:
     return [_or_since(finding, evidence)]
 
 
-def _dead(gyro_fit: GyroFit, R: FloatArray, axis: int) -> InertialFinding:
-    """The finding of a gyro that shows nothing of rotations about an axis, mapped by a rotation
+def _dead(gyro_fit: GyroFit, R: FloatArray, axes: list[int]) -> InertialFinding:
+    """The finding of a gyro that shows nothing of rotations about some axes, mapped by a rotation
     (3, 3).
     """
-    by_camera = (R.T @ gyro_fit.S_cc @ R)[axis, axis]
-    camera, gyro = np.degrees(np.sqrt([by_camera, gyro_fit.S_gg[axis, axis]]))
+    by_camera = (R.T @ gyro_fit.S_cc @ R).diagonal()[axes].sum()
+    by_gyro = gyro_fit.S_gg.diagonal()[axes].sum()
+    camera, gyro = np.degrees(np.sqrt([by_camera, by_gyro]))
     return InertialFinding(
         "gyro dead",
-        f"about {'xyz'[axis]} of the IMU the camera rotates at {camera:.1f} deg/s (RMS), the gyro "
-        f"at {gyro:.1f} deg/s, while the other axes agree",
-        "the gyro is dead about it, or its column is missing or another sensor's",
+        f"about {' and '.join('xyz'[axis] for axis in axes)} of the IMU the camera rotates at "
+        f"{camera:.1f} deg/s (RMS), the gyro at {gyro:.1f} deg/s, while the rest agrees",
+        "the gyro is dead there, or its columns are missing or another sensor's",
     )
 
 

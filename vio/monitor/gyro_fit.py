@@ -31,12 +31,15 @@ class _RateRules(NamedTuple):
     chance_intervals: float = 30.0
     clearly_worse: float = 2.0
     named_offset_s: float = 0.02
-    # of the rotation, that a gyro leaves which agrees up to some interval, as it is given
-    left_share: float = 0.1
-    lengths: Tolerance[int] = 20  # of a record that are tried
-    # of the rate about an axis: what one that is dead shows of it at most, and by how much the
-    # others may be off
+    # of the rate about an axis: what one that is dead shows of it at most, and by how much one that
+    # agrees is off
     dead_share: float = 0.3
+    off_share: float = 0.3
+    # Where a gyro has agreed up to some interval: of the rotation that it leaves, as it is given, and
+    # by how much more what fits since leaves
+    left_share: float = 0.1
+    damping: Tolerance[float] = 0.01  # of that fit, where nothing turns
+    lengths: Tolerance[int] = 20  # of a record, after which it is looked for
 
 
 _RATES = _RateRules()
@@ -122,9 +125,9 @@ class GyroFit:
             float(np.sqrt(_RATES.chance_intervals / max(self.count, 1) * self.unexplained)),
         )
 
-    def dead_axis(self, R: FloatArray) -> int | None:
-        """Return which axis of a gyro shows nothing of the rotation about it, while the others,
-        mapped by a rotation (3, 3), show all; None: it is not one of them.
+    def dead_axes(self, R: FloatArray) -> list[int]:
+        """Return which axes of a gyro show nothing of the rotation about them, while the others,
+        mapped by a rotation (3, 3), show all; nothing: it is none of them, or all.
         """
         camera = self.camera[self.covered] @ R
         gyro = self.gyro[self.covered]
@@ -134,10 +137,11 @@ class GyroFit:
         off = (camera - gyro).std(axis=0)
         clear = total > self._clear_radps
         dead = clear & (shown < _RATES.dead_share * total)
-        if np.count_nonzero(dead) != 1 or np.count_nonzero(clear) < 2:
-            return None
-        axis = int(dead.argmax())
-        return axis if off[~dead].max() < _RATES.dead_share * total[axis] else None
+        alive = clear & ~dead
+        if not dead.any() or not alive.any():
+            return []
+        agree = off[~dead] < _RATES.off_share * np.maximum(total[~dead], total[dead].min())
+        return dead.nonzero()[0].tolist() if agree.all() else []
 
     def fits(self, C: FloatArray) -> bool:
         """Return whether an orthogonal map (3, 3) from gyro to camera is accepted at its best
@@ -204,25 +208,32 @@ def fits_backwards(record: Record, least: int, R_cam0_imu: FloatArray) -> bool:
 
 
 def agreed_until(record: Record, least: int, R_cam0_imu: FloatArray) -> float | None:
-    """Return the end, in seconds of a record's clock, of the first intervals in which the gyro,
-    mapped by the given rotation (3, 3), explains the camera's rotation; None: they are fewer than
-    `least`, or all.
+    """Return until when, in seconds of a record's clock, the gyro, mapped by a rotation (3, 3),
+    explains the camera's rotation, as it does not since; None: there is no such time, with `least`
+    intervals before it and after.
+
+    The map that fits best since must not fit before: one of a wrong scale of an axis does, where
+    nothing has turned about it yet.
     """
-    noise = robust_sigma(np.diff(record.twists[:, 3:], 2, axis=0)) / np.sqrt(6)
-    count = len(record.twists)
+    means, covered = record.means(np.zeros(1))
+    gyro = means[0, covered[0], :3]
+    camera = record.twists[covered[0], 3:] @ R_cam0_imu
     until = None
-    for length in np.unique(np.linspace(least, count - 1, _RATES.lengths).astype(np.int64)):
-        head = replace(
-            record,
-            begin=record.begin[:length],
-            end=record.end[:length],
-            twists=record.twists[:length],
+    if len(gyro) < 2 * least:
+        return None
+    for length in np.unique(np.linspace(least, len(gyro) - least, _RATES.lengths).astype(np.int64)):
+        turns, g = (x[:length] - x[:length].mean(axis=0) for x in (camera, gyro))
+        since, g_since = (x[length:] - x[length:].mean(axis=0) for x in (camera, gyro))
+        S = g_since.T @ g_since
+        damped = S + (_RATES.damping * float(np.trace(S)) + 1e-300) * _I3
+        D = np.linalg.solve(damped, g_since.T @ (since - g_since))
+        total, as_given, as_since = (
+            float(np.sum(x * x)) for x in (turns, turns - g, turns - g - g @ D)
         )
-        fit = _at_offset(head, np.zeros(1), least, noise)
-        if fit is None or not fit.axes:
-            continue
-        if fit.unexplained + fit.excess(R_cam0_imu, 1.0) ** 2 < _RATES.left_share:
-            until = float(head.end[-1])
+        is_clear = total > length * _RATES.min_rate_radps**2
+        share = _RATES.left_share * total
+        if is_clear and as_given < share and as_since - as_given > share:
+            until = float(record.end[covered[0]][length - 1])
     return until
 
 

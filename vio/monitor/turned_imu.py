@@ -18,6 +18,7 @@ from vio.numerics.robust import jackknife
 
 _BLOCKS: Tolerance[int] = 10  # of the record, for the jackknife
 _STEPS: Tolerance[int] = 8  # of the linear fit, which begins at no turn
+_DAMPING: Tolerance[float] = 1e-9
 _I3 = np.eye(3)
 # axes of a cross product: component k is that of the next and the last one, less the reverse
 _NEXT = [1, 2, 0]
@@ -80,7 +81,9 @@ def _fits(
         cross = R @ gyro_camera
         scale = cross[:, diagonal, diagonal].sum(axis=1) / total
         torque = cross[:, _NEXT, _LAST] - cross[:, _LAST, _NEXT]  # mean of turned x camera
-        information = total[:, None, None] * _I3 - R @ gyro_gyro @ np.swapaxes(R, 1, 2)
+        # damped: about the only axis of all rotation nothing is known
+        information = (1.0 + _DAMPING) * total[:, None, None] * _I3
+        information -= R @ gyro_gyro @ np.swapaxes(R, 1, 2)
         turn = np.linalg.solve(information, torque[..., None])[..., 0]
         rotation = rotation + turn / scale[:, None]
     return rotation, scale
