@@ -65,6 +65,12 @@ def test_what_takes_the_place_of_another_thing_is_named(
     )
     for part in (table, flight / "mav0" / "cam0", flight / "mav0" / "cam0" / "data"):
         assert "is a part of the recording" in refused(capsys, "inspect", part)
+    other = flight / "mav0" / "notes" / "readme.txt"
+    other.parent.mkdir()
+    other.write_text("mine\n")
+    for beside in (other, other.parent):
+        assert "no known recording" in refused(capsys, "inspect", beside)
+    shutil.rmtree(other.parent)
     assert "is a folder; give a file of poses" in refused(
         capsys, "run", flight, "--reference", flight, "--out", tmp_path / "out"
     )

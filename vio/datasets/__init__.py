@@ -12,12 +12,16 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vio.datasets.reader import Reader
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.files.inputs import check_regular
 from vio.protocols import Dataset
+
+if TYPE_CHECKING:
+    from vio.datasets.unused import Layout
 
 __all__ = ["MODULES", "DatasetSettings", "in_colour", "open_dataset", "readers"]
 
@@ -233,14 +237,28 @@ def _recording_of(path: Path) -> Path | None:
     """
     from vio.datasets.plain import pair_layout
 
-    for folder in path.absolute().parents[:_LEVELS_ABOVE]:
+    given = path.absolute()
+    for folder in given.parents[:_LEVELS_ABOVE]:
         with contextlib.suppress(OSError, DataError):  # cannot be listed
             layout = pair_layout(folder)
             if layout is not None:
-                own = layout.left.parent
-                home = own.parent if layout.left.name in _INNER else own
-                return home if home in path.absolute().parents else None
+                return _home_of(given, layout)
     return None
+
+
+def _home_of(given: Path, layout: Layout) -> Path | None:
+    """Return the folder of a recording, of which a path is a camera's or an IMU's, or a file beside
+    those; None: it is something else there.
+    """
+    own = layout.left.parent
+    home = own.parent if layout.left.name in _INNER else own
+    if home not in given.parents:
+        return None
+    within = given.relative_to(home).parts
+    if within[0] in {image.relative_to(home).parts[0] for image in (layout.left, layout.right)}:
+        return home
+    is_beside = len(within) == 1 or within[0].startswith("imu")
+    return home if is_beside and given.is_file() else None
 
 
 def _folder_kind(path: Path) -> str | None:
