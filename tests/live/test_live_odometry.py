@@ -391,6 +391,16 @@ def test_a_slow_computer_is_named_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "10 of the last 12 frames left out" in line
 
 
+@pytest.fixture
+def usual_gc() -> Iterator[None]:
+    """The collector as Python has it, whatever commands in this process have set."""
+    before = gc.get_threshold()
+    gc.set_threshold(700, 10, 10)
+    yield
+    gc.set_threshold(*before)
+
+
+@pytest.mark.usefixtures("usual_gc")
 def test_warming_up_changes_no_pose_and_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
     thresholds = gc.get_threshold()
     small = replace(CAMERA, width=320, height=200, cu=160.0, cv=100.0)
