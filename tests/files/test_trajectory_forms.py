@@ -110,6 +110,12 @@ STATED = {
         XYZW,
         ",",
     ),
+    "one word before all": (
+        "timestamp [ns],gt_x,gt_y,gt_z,gt_qx,gt_qy,gt_qz,gt_qw",
+        NS,
+        XYZW,
+        ",",
+    ),
     "an index and a latency": (
         "timestamp [ns],index,latency,quality,hz,tx,ty,tz,qx,qy,qz,qw",
         NS,

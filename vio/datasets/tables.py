@@ -58,7 +58,8 @@ _OF_SECONDS = (  # names of parts of a second, with their lengths
 )
 _YEARS = range(1970, 2262)  # whose nanoseconds are times
 _COUNTER = "sampletimefine"  # a clock that is called by what it counts: two makes, two ticks
-_COARSE_TICK_NS, _FINE_TICK_NS = 100_000, 1000
+_COARSE_TICK_NS = 100_000
+_FINE_TICK_NS = 1000
 _MAX_COARSE_STEP = 1000  # between readings, of the coarse ticks
 # of a time that is counted from another one
 _RELATIVE = re.compile(r"relative|elapsed|delta|offset")

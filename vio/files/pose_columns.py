@@ -36,7 +36,9 @@ _QUATERNION_STEMS = (
     *("quat", "rot", "att", "q"),
 )
 _MAX_OTHER_STEM = 6  # letters of another name of a position
-_OTHER = re.compile(r"^(?:v|b|w|a|g|om|ang|lin|gyr|acc|std|cov|sig|euler|roll|pitch|yaw)")
+_OTHER = re.compile(
+    r"^(?:v|b|w(?!orld)|a|g(?!t$|round)|om|ang|lin|gyr|acc|std|cov|sig|euler|roll|pitch|yaw)"
+)
 _OF_A_POSITION = frozenset(
     ("std", "stddev", "cov", "var", "sigma", "err", "error", "vel", "velocity")
 )
