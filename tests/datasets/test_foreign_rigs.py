@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,3 +86,117 @@ def test_a_lens_that_is_not_known_is_refused_by_its_name(tool: str, tmp_path: Pa
 def test_table_of_formats_is_what_the_readers_do() -> None:
     page = (ROOT / "docs" / "recordings.md").read_text(encoding="utf-8")
     assert table() == page.split(BEGIN)[1].split("<!-- end -->")[0].strip()
+
+
+def _scene(folder: Path, change: Callable[[list[Any]], None], lens: str = "pinhole") -> Path:
+    """cuVSLAM's scene, after a change of its list of cameras."""
+    path = forms.edex(
+        folder, forms.rectified_rig() if lens == "pinhole" else forms.true_rig(), lens
+    )
+    scene = json.loads(path.read_text())
+    change(scene[0]["cameras"])
+    path.write_text(json.dumps(scene))
+    return path
+
+
+def _set(key: str, value: object) -> Callable[[list[Any]], None]:
+    def change(cameras: list[Any]) -> None:
+        for camera in cameras:
+            camera["intrinsics"][key] = value
+
+    return change
+
+
+def test_a_scene_may_call_its_lens_fisheye4(tmp_path: Path) -> None:
+    path = forms.edex(tmp_path, forms.true_rig("equidistant"), "fisheye")
+    path.write_text(path.read_text().replace('"fisheye"', '"fisheye4"'))
+    _close(vio.load_rig(path), forms.imu_free(forms.true_rig("equidistant")))
+
+
+@pytest.mark.parametrize("model", ["pinhole", None])
+def test_distortion_without_its_model_is_refused(model: str | None, tmp_path: Path) -> None:
+    def change(cameras: list[Any]) -> None:
+        _set("distortion_params", [-0.2, 0.05, 0, 0, 0])(cameras)
+        for camera in cameras:
+            del camera["intrinsics"]["distortion_model"]
+            if model is not None:
+                camera["intrinsics"]["distortion_model"] = model
+
+    path = _scene(tmp_path, change)
+    with pytest.raises(
+        CalibrationError, match="camera 0: states distortion_params, which a pinhole"
+    ):
+        vio.load_rig(path)
+    for none in (None, [], [0.0] * 5):
+        _close(
+            vio.load_rig(_scene(tmp_path, _set("distortion_params", none))),
+            forms.imu_free(forms.rectified_rig()),
+        )
+
+
+def _third(path: Path, whole: Callable[[Any], list[Any]], change: Callable[[Any], Any]) -> None:
+    data = json.loads(path.read_text())
+    cameras = whole(data)
+    cameras.append(change(copy.deepcopy(cameras[-1])))
+    path.write_text(json.dumps(data))
+
+
+def test_a_third_camera_is_not_read(tmp_path: Path) -> None:
+    def ftheta(camera: Any) -> Any:
+        camera["intrinsics"]["distortion_model"] = "ftheta"
+        return camera
+
+    path = _scene(tmp_path, lambda cameras: None)
+    _third(path, lambda data: data[0]["cameras"], ftheta)
+    rig = vio.load_rig(path)
+    _close(rig, forms.imu_free(forms.rectified_rig()))
+    assert any("of 3 cameras the first two are used" in note for note in rig.notes)
+    path = forms.spectacular(tmp_path)
+    _third(path, lambda data: data["cameras"], lambda camera: {**camera, "model": "ftheta"})
+    assert any(
+        "of 3 cameras the first two" in note
+        for note in vio.load_rig(path, image_size=forms.SIZE).notes
+    )
+    path = forms.basalt("eucm", tmp_path) / "calibration.json"
+    value = json.loads(path.read_text())["value0"]
+    for key in ("T_imu_cam", "intrinsics", "resolution"):
+        value[key].append(None)
+    path.write_text(json.dumps({"value0": value}))
+    assert any(
+        "of 3 cameras the first two" in note
+        for note in vio.load_rig(path, image_size=forms.SIZE).notes
+    )
+
+
+@pytest.mark.parametrize("item", [None, 7])
+def test_a_camera_that_is_no_block_is_refused(item: object, tmp_path: Path) -> None:
+    for write, keys in (
+        (lambda: _scene(tmp_path, lambda cameras: None), (0, "cameras")),
+        (lambda: forms.spectacular(tmp_path), ("cameras",)),
+        (lambda: forms.basalt("eucm", tmp_path) / "calibration.json", ("value0", "intrinsics")),
+        (lambda: forms.basalt("eucm", tmp_path) / "calibration.json", ("value0", "T_imu_cam")),
+    ):
+        path = write()
+        data = json.loads(path.read_text())
+        cameras = data
+        for key in keys:
+            cameras = cameras[key]
+        cameras[1] = item
+        path.write_text(json.dumps(data))
+        with pytest.raises(CalibrationError, match=f"camera 1: is {item}, no block of entries"):
+            vio.load_rig(path, image_size=forms.SIZE)
+
+
+@pytest.mark.parametrize("block", [False, True])
+@pytest.mark.parametrize("setup", ["RGBD", "monocular"])
+def test_settings_of_one_camera_are_no_stereo_rig(setup: str, block: bool, tmp_path: Path) -> None:
+    path = forms.openvslam(tmp_path, block=block)
+    depths = "Preprocessing: {depthmap_factor: 5000.0}" if block else "depthmap_factor: 5000.0"
+    text = (
+        path.read_text().replace("setup: stereo", f"setup: {setup}").replace("k1: 0.0", "k1: 0.26")
+    )
+    path.write_text(f"{text}{depths}\n")
+    rig = vio.load_rig(path)
+    assert len(rig.cameras) == 1
+    assert rig.cam0.coefficients[0] == 0.26
+    assert rig.depth_factor == (5000.0 if setup == "RGBD" else None)

@@ -60,6 +60,45 @@ def test_views_of_one_camera_are_not_doubted() -> None:
     assert halves_note(41, repeated) is None
 
 
+def _repeating(scene: str, width: int = 640) -> Image:
+    """A view that looks the same along its rows, (480, width)."""
+    y, x = np.mgrid[:480, :width]
+    shades = {
+        "horizon": np.where(y < 200, 200, 90),
+        "tilted horizon": np.where(y < 200 + 0.05 * x, 200, 90),
+        "bricks": 100 + 60 * (((y // 24) % 2 * 20 + x) % 40 > 3) * (y % 24 > 3),
+        "fence": 80 + 100 * (x % 32 < 10),
+        "wide fence": 80 + 100 * (x % 107 < 36),
+        "checkerboard": 60 + 140 * ((x // 60 + y // 60) % 2),
+        "small checkerboard": 60 + 140 * ((x // 20 + y // 20) % 2),
+        "large checkerboard": 60 + 140 * ((x // 80 + y // 80) % 2),
+    }
+    noise = np.random.default_rng(0).normal(0, 6, y.shape)
+    return (shades[scene] + noise).clip(0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        *("horizon", "tilted horizon", "bricks", "fence", "wide fence"),
+        *("checkerboard", "small checkerboard", "large checkerboard"),
+    ],
+)
+@pytest.mark.parametrize("turned", [False, True])
+def test_views_that_are_alike_along_their_rows_are_not_doubted(scene: str, turned: bool) -> None:
+    image = _repeating(scene)
+    assert halves_note(40, lambda k: image[:, ::-1] if turned else image) is None
+
+
+def test_a_pair_with_a_horizon_is_doubted() -> None:
+    def load(k: int) -> Image:
+        both = 0.5 * _pair(k, 12).astype(np.float64)
+        both[: SIZE[1] // 2] += 100
+        return both.astype(np.uint8)
+
+    assert halves_note(40, load) is not None
+
+
 def test_unreadable_images_are_not_judged() -> None:
     def load(k: int) -> Image:
         raise UnreadableImageError("no")

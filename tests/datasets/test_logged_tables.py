@@ -11,7 +11,7 @@ import pytest
 from tests.plain_maker import make_plain
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
-from vio.datasets.tables import names_readings
+from vio.datasets.tables import names_readings, read_imu_table
 from vio.errors import DataError
 from vio.records import ImuSample
 
@@ -96,6 +96,42 @@ FORMS |= {
 }
 
 
+_DATE = "year,month,day,hour,minute,second"
+_SENSORS = "Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z"
+FORMS |= {
+    "a time before a date of whole seconds": (
+        f"timestamp,{_DATE},{_SENSORS}",
+        lambda t, v: [str(t), *_date(t), *v[3:], *v[:3]],
+    ),
+    "a time before a date that a receiver has not yet": (
+        f"timestamp,{_DATE},{_SENSORS}",
+        lambda t, v: [str(t), *"000000", *v[3:], *v[:3]],
+    ),
+    "a date and milliseconds": (
+        f"{_DATE},Millisecond,{_SENSORS}",
+        lambda t, v: [*_date(t), str(t % 10**9 // 10**6), *v[3:], *v[:3]],
+    ),
+    "a date and ms": (
+        f"n,{_DATE},ms,{_SENSORS}",
+        lambda t, v: ["1", *_date(t), str(t % 10**9 // 10**6), *v[3:], *v[:3]],
+    ),
+    "a date and microseconds": (
+        f"{_DATE},usec,{_SENSORS}",
+        lambda t, v: [*_date(t), str(t % 10**9 // 1000), *v[3:], *v[:3]],
+    ),
+    "decimals of seconds and their milliseconds": (
+        f"{_DATE},milliseconds,{_SENSORS}",
+        lambda t, v: [
+            *_date(t)[:5],
+            f"{int(_date(t)[5]) + t % 10**9 / 1e9:.9f}",
+            str(t % 10**9 // 10**6),
+            *v[3:],
+            *v[:3],
+        ],
+    ),
+}
+
+
 def _date(t_ns: int) -> list[str]:
     whole = np.datetime64(t_ns // 10**9, "s").astype(object)
     return [
@@ -114,9 +150,21 @@ def test_the_columns_of_a_logger_are_found_by_their_names(form: str, tmp_path: P
     assert not any("doubtful" in note for note in open_dataset(folder).recording.notes)
 
 
-def test_columns_of_no_date_are_refused(tmp_path: Path) -> None:
+def test_a_counter_in_microseconds_is_told_by_its_steps(tmp_path: Path) -> None:
+    path = tmp_path / "imu.csv"
+    rows = "".join(f"{k},{7_000_000 + 8333 * k},0,0,9.8,0.1,0,0\n" for k in range(20))
+    path.write_text(f"PacketCounter,SampleTimeFine,{_SENSORS}\n{rows}")
+    record, _ = read_imu_table(path)
+    np.testing.assert_array_equal(record.times_ns, 1000 * (7_000_000 + 8333 * np.arange(20)))
+
+
+@pytest.mark.parametrize(
+    "date",
+    ["2024,13,1,1,1,1.5", "24,1,1,1,1,1.5", "2024,1,1,1,1,nan", "2024,1,1,1,1,inf", "0,0,0,0,0,0"],
+)
+def test_columns_of_no_date_are_refused(date: str, tmp_path: Path) -> None:
     folder = make_plain(tmp_path)
-    cells = lambda t, v: ["2024", "13", "1", "1", "1", "1.5", *v]  # noqa: E731
+    cells = lambda t, v: [*date.split(","), *v]  # noqa: E731
     header = "year,month,day,hour,minute,second,gx,gy,gz,ax,ay,az"
     (folder / "imu.csv").write_text(_text(header, _samples(folder), cells))
     with pytest.raises(DataError, match="line 2: its columns of year to second hold no date"):

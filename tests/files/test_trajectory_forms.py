@@ -98,6 +98,54 @@ STATED = {
     ),
     "centimetres in brackets": ("# t [ns] x [cm] y [cm] z [cm] qx qy qz qw", NS, [100 * P, Q], " "),
     "east, north, up": ("time_ns,easting,northing,altitude,qx,qy,qz,qw", NS, XYZW, ","),
+    "a bare quaternion beside a named position": (
+        "timestamp [ns],w,x,y,z,tx,ty,tz",
+        NS,
+        [WXYZ[1], P],
+        ",",
+    ),
+    "a bare quaternion behind a bare position": (
+        "timestamp [ns],x,y,z,x,y,z,w",
+        NS,
+        XYZW,
+        ",",
+    ),
+    "one word before all": (
+        "timestamp [ns],gt_x,gt_y,gt_z,gt_qx,gt_qy,gt_qz,gt_qw",
+        NS,
+        XYZW,
+        ",",
+    ),
+    "an index and a latency": (
+        "timestamp [ns],index,latency,quality,hz,tx,ty,tz,qx,qy,qz,qw",
+        NS,
+        [ZERO[:, :4] + 9, *XYZW],
+        ",",
+    ),
+    "another vector before": (
+        "timestamp [ns],magx,magy,magz,ref_x,ref_y,ref_z,x,y,z,qx,qy,qz,qw",
+        NS,
+        [ZERO + 50, *XYZW],
+        ",",
+    ),
+    "standard deviations before": (
+        "timestamp [ns],p_std_x,p_std_y,p_std_z,p_x,p_y,p_z,qx,qy,qz,qw",
+        NS,
+        [ZERO[:, :3] + 50, *XYZW],
+        ",",
+    ),
+    "an update and a mask": (
+        "timestamp [ns],update,elevation_mask,east_std,east,north,up,qx,qy,qz,qw",
+        NS,
+        [ZERO[:, :3] + 9, *XYZW],
+        ",",
+    ),
+    "a week's seconds and a source": (
+        "time_ns,tow,source,x,y,z,qx,qy,qz,qw",
+        NS,
+        [ZERO[:, :2], *XYZW],
+        ",",
+    ),
     "rostopic": (
         "%time [ns],field.header.seq,field.pose.position.x,field.pose.position.y,"
         "field.pose.position.z,field.pose.orientation.x,field.pose.orientation.y,"
@@ -147,6 +195,8 @@ ALONE = {
         [ZERO[:, :4], P, ZERO[:, :3]],
         ",",
     ),
+    "an index": ("time_ns,index,x,y,z", [ZERO[:, 0] + 9, P], ","),
+    "a latency": ("time_ns,latency,x,y,z", [ZERO[:, 0] + 9, P], ","),
     "a speed": ("time_ns,x,y,z,speed", [P, ZERO[:, 0]], ","),
 }
 
@@ -174,6 +224,17 @@ REFUSED = {
     "two units": (
         "t,x_mm,y_mm,z_cm,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n",
         "several units of the position",
+    ),
+    "feet": ("t,x_ft,y_ft,z_ft,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n", "states positions in 'ft'"),
+    "inches": ("t,x [in],y [in],z [in]\n1,0,0,0\n", "states positions in 'in'"),
+    "micrometres": ("# t x [µm] y [µm] z [µm]\n1 0 0 0\n", "states positions in 'um'"),
+    "a unit and no quaternion": (
+        "t,x [mm],y [mm],z [mm],a,b,c,d\n1,0,0,0,0,0,0,1\n",
+        "names no quaternion behind it; name its columns",
+    ),
+    "standard deviations and one letter": (
+        "t,east_std,north_std,up_std,E,N,U,qx,qy,qz,qw\n1,0,0,0,1,2,3,0,0,0,1\n",
+        "the quaternion has norm",
     ),
     "COLMAP": (
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n1 1 0 0 0 0 0 0 1 0.png\n",
@@ -354,6 +415,34 @@ def test_decimal_commas_between_semicolons_or_tabs_are_read(separator: str, tmp_
     read = read_trajectory(local)
     np.testing.assert_array_equal(read.T_world_body, expected.T_world_body)
     assert read.times_ns.tolist() == expected.times_ns.tolist()
+
+
+@pytest.mark.parametrize("first", ["r11 r12 r13 tx", "R00 R01 R02 x"])
+def test_a_header_may_name_the_elements_of_matrices(first: str, tmp_path: Path) -> None:
+    rows = " ".join([first, first.replace("x", "y"), first.replace("x", "z")])
+    poses = TRUTH.T_world_body[:, :3].reshape(COUNT, 12)
+    text = "\n".join(" ".join(map(repr, row)) for row in poses.tolist())
+    (tmp_path / "poses.txt").write_text(f"# {rows}\n{text}\n")
+    found = read_trajectory(tmp_path / "poses.txt")
+    assert found.times_ns is None
+    np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body, atol=1e-12)
+    led = "\n".join(f"{t} {row}" for t, row in zip(SECONDS, text.split("\n"), strict=True))
+    (tmp_path / "poses.txt").write_text(f"# time {rows}\n{led}\n")
+    found = read_trajectory(tmp_path / "poses.txt")
+    np.testing.assert_array_equal(found.times_ns, TIMES_NS)
+    np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+def test_units_of_positions_that_are_applied_or_unknown_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    header = "t [ns],x_cm,y_cm,z_cm"
+    read_trajectory(_write(tmp_path / "a.csv", header, NS, [100 * P], ","))
+    assert "x_cm, y_cm, z_cm are converted to metres, by 0.01" in caplog.text
+    header = "t [ns],x [vu],y [vu],z [vu]"
+    found = read_trajectory(_write(tmp_path / "b.csv", header, NS, [P], ","))
+    np.testing.assert_allclose(found.positions, P, atol=1e-12)
+    assert "doubtful: the unit 'vu' of x [vu], y [vu], z [vu] is not known" in caplog.text
 
 
 def test_whole_matrices_are_read(tmp_path: Path) -> None:

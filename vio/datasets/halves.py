@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from vio.datasets.images import UnreadableImageError
 from vio.numerics.kinds import Tolerance
 from vio.records import Image
+
+FloatImage: TypeAlias = npt.NDArray[np.float32]
 
 
 class _HalvesRules(NamedTuple):
@@ -20,8 +23,13 @@ class _HalvesRules(NamedTuple):
     blur_px: Tolerance[float] = 6.0  # of what is taken off them
     most_aside: float = 0.25  # of the width, by which they are shifted against one another
     most_rows: int = 3  # likewise, of halves so small
-    # halves of one camera's images correlate by 0.09 to 0.33 (median), those of pairs by 0.55 to 0.92
-    least_correlation: float = 0.45
+    # halves of one camera's images correlate by 0.05 to 0.18 (median), those of pairs by 0.44 to 0.97
+    least_correlation: float = 0.35
+    strip: float = 1 / 3  # of a half's width, which is looked for elsewhere in that half
+    own_lobe_px: Tolerance[int] = 8  # around its place, where a strip is like itself
+    # of that of the halves, above which a scene repeats itself; 0.2 to 0.55 of it in pairs, 0.8 to 1.5
+    # in views of bricks, boards, fences and a tilted horizon
+    most_alike: float = 0.7
 
 
 _RULES = _HalvesRules()
@@ -49,7 +57,11 @@ def halves_note(count: int, load: Callable[[int], Image]) -> str | None:
 
 
 def _correlation(image: Image) -> float:
-    """Return the largest normalised correlation of an image's halves, shifted against one another."""
+    """Return the largest normalised correlation of an image's halves, shifted against one another; 0:
+    the left half is as much like itself elsewhere.
+
+    Each row is taken without its mean: what is alike along rows, as a horizon is, tells nothing.
+    """
     import cv2
 
     height, width = image.shape
@@ -62,9 +74,26 @@ def _correlation(image: Image) -> float:
         for half in (image[:, : width // 2], image[:, width - width // 2 :])
     )
     left, right = (half - cv2.GaussianBlur(half, (0, 0), _RULES.blur_px) for half in (left, right))
+    left, right = (half - half.mean(axis=1, keepdims=True) for half in (left, right))
     aside = round(_RULES.most_aside * _RULES.width_px)
-    rows = _RULES.most_rows
-    inner = left[rows : size[1] - rows, aside : size[0] - aside]
-    if not inner.any() or not right.any():
-        return 0.0
-    return float(cv2.matchTemplate(right, np.ascontiguousarray(inner), cv2.TM_CCORR_NORMED).max())
+    found = float(_alike(left, slice(aside, size[0] - aside), right).max())
+    strip = round(_RULES.strip * _RULES.width_px)
+    for start in (0, size[0] - strip):
+        of_strip = _alike(left, slice(start, start + strip), left)
+        elsewhere = np.abs(np.arange(of_strip.shape[1]) - start) > _RULES.own_lobe_px
+        if of_strip[:, elsewhere].max() > _RULES.most_alike * found:
+            return 0.0
+    return found
+
+
+def _alike(half: FloatImage, columns: slice, other: FloatImage) -> FloatImage:
+    """Return the normalised correlation of some columns of a half with another one (H, W), at each
+    shift against it (rows, columns).
+    """
+    import cv2
+
+    part = np.ascontiguousarray(half[_RULES.most_rows : len(half) - _RULES.most_rows, columns])
+    if not part.any() or not other.any():
+        shape = [n - m + 1 for n, m in zip(other.shape, part.shape, strict=True)]
+        return np.zeros(shape, dtype=np.float32)
+    return cv2.matchTemplate(other, part, cv2.TM_CCORR_NORMED).astype(np.float32)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -51,8 +51,16 @@ _UNITS_OF_A_LOG = ("i", "instance", "imu_id", "imu", "device_id", "sensor_id")
 _TIME = re.compile(r"time|stamp|sec|\bt\b|tow\b")  # in a cell of a header in small letters
 # ends of names of the parts of a date, in order, and of what may follow them
 _DATE_PARTS = ("year", "month", "day", "hour", "min(?:ute)?", "sec(?:ond)?s?")
-_NANOS = re.compile(r"nano(?:sec(?:ond)?s?)?$|nsecs?$")
-_TICKS_NS = {"sampletimefine": 100_000}  # of clocks that are called by what they count
+_OF_SECONDS = (  # names of parts of a second, with their lengths
+    (re.compile(r"nano(?:sec(?:ond)?s?)?$|nsecs?$"), 1),
+    (re.compile(r"micro(?:sec(?:ond)?s?)?$|^(?:utc|gps)?(?:us|usecs?)$"), 1000),
+    (re.compile(r"milli(?:sec(?:ond)?s?)?$|^(?:utc|gps)?(?:ms|msecs?)$"), 1_000_000),
+)
+_YEARS = range(1970, 2262)  # whose nanoseconds are times
+_COUNTER = "sampletimefine"  # a clock that is called by what it counts: two makes, two ticks
+_COARSE_TICK_NS = 100_000
+_FINE_TICK_NS = 1000
+_MAX_COARSE_STEP = 1000  # between readings, of the coarse ticks
 # of a time that is counted from another one
 _RELATIVE = re.compile(r"relative|elapsed|delta|offset")
 # of what is no reading, though it is called by one: covariances, rates, biases
@@ -569,16 +577,31 @@ def _columns_of(table: NumberTable, columns: Sequence[int]) -> NumberTable:
 
 
 def _time_first(table: NumberTable) -> NumberTable:
-    """Return a table whose stamps are the column that its header calls the time, or the seconds and
-    nanoseconds of two columns; as it is where the header names none.
+    """Return a table whose stamps are the column that its header calls the time, the seconds and
+    nanoseconds of two columns, or the dates of several; as it is where the header names none.
 
-    The stamp of a message goes before that of its recording, an absolute time before others.
+    The stamp of a message goes before that of its recording, an absolute time before others, and any
+    of them before dates that are invalid, or in whole seconds.
     """
-    if (parts := _date_columns(table.header)) is not None:
-        return _dated(table, parts)
-    times = [k for k, cell in enumerate(table.header) if _TIME.search(cell)]
-    if not times:
-        return table
+    date = _date_columns(table.header)
+    of_date = date.columns if date is not None else frozenset()
+    times = [k for k, cell in enumerate(table.header) if k not in of_date and _TIME.search(cell)]
+    if date is not None:
+        try:
+            dated = _dated(table, date)
+        except DataError:
+            if not times:
+                raise
+        else:
+            if not times or any(int(stamp) % NS_PER_S for stamp in dated.stamps):
+                return dated
+    return _timed(table, times) if times else table
+
+
+def _timed(table: NumberTable, times: Sequence[int]) -> NumberTable:
+    """Return a table whose stamps are one of several columns of times, or that and the one behind it
+    where they hold seconds and nanoseconds.
+    """
     stamp = min(times, key=lambda k: _rank_of_time(table.header[k]))
     names = [re.sub(r"[^a-z]", "", cell) for cell in table.header[stamp:][:2]]
     rest = stamp + 1
@@ -587,8 +610,8 @@ def _time_first(table: NumberTable) -> NumberTable:
         and _SECONDS.search(names[0]) is not None
         and _NANOSECONDS.search(names[1]) is not None
     )
-    tick_ns = _TICKS_NS.get(names[0])
-    if stamp == 0 and not in_parts and tick_ns is None:
+    is_counter = names[0] == _COUNTER
+    if stamp == 0 and not in_parts and not is_counter:
         return table
     # their digits, of which numbers keep sixteen
     rows = itertools.islice(table_rows(table.path, len(table.header), _IMU_FORM, []), 1, None)
@@ -598,9 +621,9 @@ def _time_first(table: NumberTable) -> NumberTable:
     if in_parts and all(part.isdigit() for pair in cells for part in pair):
         header = "time [ns]"
         stamps = tuple(str(int(whole) * NS_PER_S + int(part)) for whole, part in cells)
-    elif tick_ns is not None and all(whole.isdigit() for whole in stamps):
+    elif is_counter and all(whole.isdigit() for whole in stamps):
         header = "time [ns]"
-        stamps = tuple(str(int(whole) * tick_ns) for whole in stamps)
+        stamps = _in_nanoseconds([int(whole) for whole in stamps])
     others = [k for k in range(1, len(table.header)) if k != stamp and not (in_parts and k == rest)]
     return replace(
         table,
@@ -610,21 +633,50 @@ def _time_first(table: NumberTable) -> NumberTable:
     )
 
 
-def _date_columns(header: Sequence[str]) -> list[int] | None:
-    """Return the columns of year, month, day, hour, minute, second and, where there are, nanoseconds;
-    None: the header names no such date.
-    """
+def _in_nanoseconds(counts: Sequence[int]) -> tuple[str, ...]:
+    """Return the stamps of a counter whose tick is told by how far readings are apart."""
+    step = np.median(np.abs(np.diff(counts))) if len(counts) > 1 else 0
+    tick_ns = _COARSE_TICK_NS if step <= _MAX_COARSE_STEP else _FINE_TICK_NS
+    return tuple(str(count * tick_ns) for count in counts)
+
+
+class _DateColumns(NamedTuple):
+    """The columns of a date."""
+
+    parts: tuple[int, ...]  # of year, month, day, hour, minute, second
+    fraction: int | None  # of a part of a second, where seconds are whole; None: there is none
+    fraction_ns: int  # its length
+
+    @property
+    def columns(self) -> frozenset[int]:
+        """All of them."""
+        return frozenset(self.parts) | ({self.fraction} if self.fraction is not None else set())
+
+
+def _date_columns(header: Sequence[str]) -> _DateColumns | None:
+    """Return the columns of a date; None: the header names none, or several parts of a second."""
     names = [re.sub(r"[^a-z]", "", cell) for cell in header]
+    fractions = [
+        (k, length)
+        for form, length in _OF_SECONDS
+        for k, name in enumerate(names)
+        if form.search(name) and not re.search("stamp|^time", name)
+    ]
+    taken = {k for k, _ in fractions}
     found = [
-        [k for k, name in enumerate(names) if re.search(f"{part}$", name)] for part in _DATE_PARTS
+        [k for k, name in enumerate(names) if k not in taken and re.search(f"{part}$", name)]
+        for part in _DATE_PARTS
     ]
     if not all(found):
         return None
-    nanos = [k for k, name in enumerate(names) if _NANOS.search(name)]
-    return [*(min(columns, key=lambda k: len(names[k])) for columns in found), *nanos[:1]]
+    parts = tuple(min(columns, key=lambda k: len(names[k])) for columns in found)
+    if len({length for _, length in fractions}) > 1:
+        return None
+    fraction, length = next(iter(fractions), (None, 1))
+    return _DateColumns(parts, fraction, length)
 
 
-def _dated(table: NumberTable, parts: Sequence[int]) -> NumberTable:
+def _dated(table: NumberTable, date: _DateColumns) -> NumberTable:
     """Return a table whose stamps are the dates of several columns.
 
     Raises:
@@ -634,22 +686,36 @@ def _dated(table: NumberTable, parts: Sequence[int]) -> NumberTable:
     stamps = list[str]()
     for number, fields in rows:
         try:
-            year, month, day, hour, minute = (int(fields[k]) for k in parts[:5])
-            whole = np.datetime64(f"{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}", "ns")
-            seconds = Decimal(fields[parts[5]])
-            nanos = int(fields[parts[6]]) if len(parts) > len(_DATE_PARTS) else 0
+            stamps.append(str(_date_ns(date, fields)))
         except (ValueError, ArithmeticError) as error:
             raise DataError(
-                f"{table.path}, line {number}: its columns of year to second hold no date"
+                f"{table.path}, line {number}: its columns of year to second hold no date with a "
+                f"year of {_YEARS.start} to {_YEARS.stop - 1}"
             ) from error
-        stamps.append(str(int(whole.astype(np.int64)) + int(seconds * NS_PER_S) + nanos))
-    others = [k for k in range(1, len(table.header)) if k not in parts]
+    others = [k for k in range(1, len(table.header)) if k not in date.columns]
     return replace(
         table,
         header=("time [ns]", *(table.header[k] for k in others)),
         stamps=tuple(stamps),
         values=table.values[:, [k - 1 for k in others]],
     )
+
+
+def _date_ns(date: _DateColumns, fields: Sequence[str]) -> int:
+    """Return the time of a line in nanoseconds since 1970.
+
+    Raises:
+        ValueError, ArithmeticError: it has none.
+    """
+    year, month, day, hour, minute = (int(fields[k]) for k in date.parts[:5])
+    second = Decimal(fields[date.parts[5]])
+    fraction_ns = 0
+    if date.fraction is not None and second == int(second):
+        fraction_ns = int(Decimal(fields[date.fraction]) * date.fraction_ns)
+    if year not in _YEARS or not 0 <= second < 61 or not 0 <= fraction_ns < NS_PER_S:
+        raise ValueError("no date")
+    whole = np.datetime64(f"{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}", "ns")
+    return int(whole.astype(np.int64)) + int(second * NS_PER_S) + fraction_ns
 
 
 def _rank_of_time(cell: str) -> tuple[bool, bool]:

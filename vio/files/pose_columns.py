@@ -13,11 +13,14 @@ from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.units import (
     LENGTH_UNITS,
+    UNREAD_LENGTHS,
     factor_of,
     header_cells,
     split_cells,
     time_unit,
     time_unit_in_words,
+    unknown_unit,
+    unread_length,
     without_unit,
 )
 from vio.records import Orientations
@@ -26,19 +29,33 @@ _QUATERNION = re.compile(
     r"(?:q|quat|quaternion|rot|rotation|att|attitude|orientation)[a-z]*?([wxyz])|"
     r"[a-z]*(?:orientation|quaternion|quat)([wxyz])"
 )
-_POSITION = re.compile(
-    r"(?:p|t(?!im|stamp)|pos|position|trans|translation)?[a-z]{0,6}?([xyz])|"
-    r"[a-z]*(?:position|translation)([xyz])"
+# what stands before the letter of a component
+_POSITION_STEMS = ("position", "translation", "pos", "trans", "p", "t")
+_QUATERNION_STEMS = (
+    *("orientation", "quaternion", "rotation", "attitude"),
+    *("quat", "rot", "att", "q"),
 )
-_OTHER = re.compile(r"^(?:v|b|w|a|g|om|ang|lin|gyr|acc|std|cov|sig|euler|roll|pitch|yaw)")
+_MAX_OTHER_STEM = 6  # letters of another name of a position
+_OTHER = re.compile(
+    r"^(?:v|b|w(?!orld)|a|g(?!t$|round)|om|ang|lin|gyr|acc|std|cov|sig|euler|roll|pitch|yaw)"
+)
+_OF_A_POSITION = frozenset(
+    ("std", "stddev", "cov", "var", "sigma", "err", "error", "vel", "velocity")
+)
 # what stands where a quaternion would, and is none
 _NO_QUATERNION = re.compile(r"roll|pitch|yaw|heading|euler|azimuth|vel|speed|^v|status|std|cov")
 # components of a position on the earth, of right-handed frames
-_ON_EARTH = (
-    ("east", "north", "up"),
-    ("north", "east", "down"),
-    ("east", "north", "alt|height|elev"),
+_EAST, _NORTH, _UP, _DOWN, _HEIGHT = (
+    re.compile(rf"(?:p|pos|position|local|utm|enu|ned)?(?:{name})")
+    for name in (
+        "east(?:ing)?",
+        "north(?:ing)?",
+        "up",
+        "down",
+        "alt(?:itude)?|height|elev(?:ation)?",
+    )
 )
+_ON_EARTH = ((_EAST, _NORTH, _UP), (_NORTH, _EAST, _DOWN), (_EAST, _NORTH, _HEIGHT))
 # a component by its number, as position[0] or q_3
 _NUMBERED = re.compile(r"([a-z][a-z_. ]*?)[\[(_. ]?([0-4])[\])]?")
 _POSITION_ALONE = re.compile(r"(?:p|t|pos|position|trans|translation|xyz)")
@@ -62,6 +79,8 @@ class PoseColumns:
     unit: str | None = None  # of the stamps; None: not stated
     to_metres: float = 1.0  # of the positions
     nanoseconds: int | None = None  # column of them, where that of the stamps has whole seconds
+    names_stamp: bool = False  # whether a header names the column of the stamps
+    notes: tuple[str, ...] = ()  # about the unit of the positions
 
 
 def pose_columns(headers: Sequence[str], count: int, *, w_first: bool) -> PoseColumns:
@@ -93,7 +112,7 @@ def named_columns(headers: Sequence[str], count: int, *, w_first: bool) -> PoseC
         w_first: where the components of a quaternion are numbered from 1, whether w is the first.
 
     Raises:
-        DataError: a header states motions between two times, or several units of length.
+        DataError: a header states motions between two times, or units of length that are not read.
     """
     columns = (
         _named_columns(cells, w_first=w_first) for cells in reversed(_cells_of(headers, count))
@@ -149,18 +168,22 @@ def _named_columns(cells: Sequence[str], *, w_first: bool) -> PoseColumns | None
     place of a quaternion may be one.
 
     Raises:
-        DataError: the header states motions between two times, or several units of length.
+        DataError: the header states motions between two times, or units of length that are not
+            read.
     """
-    names = [_name_of(without_unit(cell)) for cell in cells]
-    quaternion = _components(names, _QUATERNION, "xyzw")
-    orientations: Orientations = "stated"
-    if quaternion is None:
-        quaternion, orientations = _numbered_quaternion(cells, w_first=w_first)
-    position = _position(cells, names, quaternion or ())
+    quaternion, orientations = _quaternion(cells, w_first=w_first)
+    position = _position(cells, quaternion or (), by_any_name=quaternion is not None)
     if position is None:
         return None
+    names = [_letters(without_unit(cell)) for cell in cells]
     _check_absolute(names)
+    to_metres, notes = _to_metres([cells[k] for k in position])
     if quaternion is None and not _are_positions_alone(names, position):
+        if to_metres != 1.0:
+            raise DataError(
+                "its header states a unit of the position, and names no quaternion behind it; name its "
+                "columns qx, qy, qz, qw"
+            )
         return None
     a, b, c = position
     if quaternion is None:
@@ -169,41 +192,73 @@ def _named_columns(cells: Sequence[str], *, w_first: bool) -> PoseColumns | None
     else:
         x, y, z, w = quaternion
         of_turn = (x, y, z, w)
-    stamp = _stamp_column(names)
+    named_stamp = _stamp_column(names)
+    stamp = named_stamp or 0
     after = stamp + 1
     unit = time_unit(cells[stamp])
     nanoseconds = None
     if names[stamp] in ("sec", "secs", "seconds") and "nsec" in names[after : after + 1]:
         unit = "s"
         nanoseconds = after
-    to_metres = _to_metres([cells[k] for k in position])
-    return PoseColumns(stamp, (a, b, c), of_turn, orientations, unit, to_metres, nanoseconds)
+    return PoseColumns(
+        *(stamp, (a, b, c), of_turn, orientations, unit, to_metres, nanoseconds),
+        names_stamp=named_stamp is not None,
+        notes=notes,
+    )
+
+
+def _quaternion(
+    cells: Sequence[str], *, w_first: bool
+) -> tuple[Sequence[int] | None, Orientations]:
+    """Return the columns of x, y, z, w of a quaternion, and whether the header states their order;
+    None: it names none.
+    """
+    names = [without_unit(cell) for cell in cells]
+    groups = _components(names, _QUATERNION_STEMS, "xyzw")
+    for stem, columns in groups.items():
+        if stem and (stem in _QUATERNION_STEMS or _QUATERNION.fullmatch(f"{stem}x")):
+            return columns, "stated"
+    numbered, orientations = _numbered_quaternion(cells, w_first=w_first)
+    bare = groups.get("")
+    if numbered is None and bare is not None:
+        all_bare = [k for k, name in enumerate(names) if _letters(name) in ("w", "x", "y", "z")]
+        if _position(cells, all_bare, by_any_name=False) is not None:
+            return bare, "stated"
+    return numbered, orientations
 
 
 def _position(
-    cells: Sequence[str], names: Sequence[str], quaternion: Sequence[int]
-) -> list[int] | None:
+    cells: Sequence[str], quaternion: Sequence[int], *, by_any_name: bool
+) -> Sequence[int] | None:
     """Return the columns of a position: x, y, z by name, by number, or on the earth; None: a header
     names none.
+
+    Args:
+        cells: of the header.
+        quaternion: its columns.
+        by_any_name: whether other words than those of a position may stand before x, y and z.
     """
-    lengths = [_name_of(without_unit(cell, LENGTH_UNITS)) for cell in cells]
-    usable = [
-        "" if k in quaternion or _OTHER.match(name) else length
-        for k, (name, length) in enumerate(zip(names, lengths, strict=True))
+    lengths = [
+        "" if k in quaternion else without_unit(cell, (*LENGTH_UNITS, *UNREAD_LENGTHS))
+        for k, cell in enumerate(cells)
     ]
-    named = _components(usable, _POSITION, "xyz")
-    if named is None:
-        numbers = _numbered(cells, _POSITION_ALONE)
-        named = next(
-            ([numbers[n] for n in way] for way in ("012", "123") if set(way) <= set(numbers)), None
-        )
-    if named is not None:
-        return named
+    groups = _components(lengths, _POSITION_STEMS, "xyz")
+    known = [columns for stem, columns in groups.items() if stem in _POSITION_STEMS]
+    numbers = _numbered(cells, _POSITION_ALONE)
+    found = [groups.get(""), *known]
+    found += [[numbers[n] for n in way] for way in ("012", "123") if set(way) <= set(numbers)]
+    letters = [_letters(length) for length in lengths]
     for way in _ON_EARTH:
-        found = [[k for k, name in enumerate(names) if re.match(part, name)] for part in way]
-        if all(found):
-            return [columns[0] for columns in found]
-    return None
+        columns = [[k for k, name in enumerate(letters) if part.fullmatch(name)] for part in way]
+        if all(columns):
+            found.append([k for k, *_ in columns])
+    if by_any_name:
+        found += [
+            columns
+            for stem, columns in groups.items()
+            if len(stem) <= _MAX_OTHER_STEM and not _OTHER.match(stem)
+        ]
+    return next((columns for columns in found if columns), None)
 
 
 def _numbered(cells: Sequence[str], whose: re.Pattern[str]) -> dict[str, int]:
@@ -234,8 +289,9 @@ def _numbered_quaternion(
 
 def _check_absolute(names: Sequence[str]) -> None:
     """Raise DataError where each row has the time of another one beside its own."""
-    if any(name.startswith(("source", "from")) for name in names) and any(
-        name.startswith(("dest", "target", "to")) for name in names
+    times = [name for name in names if _is_time(name)]
+    if any(name.startswith(("source", "from")) for name in times) and any(
+        name.startswith(("dest", "target", "to")) for name in times
     ):
         raise DataError(
             "its header names two times a row, as of motions from one to the other; multiply them, and "
@@ -249,31 +305,53 @@ def _are_positions_alone(names: Sequence[str], position: Sequence[int]) -> bool:
     return len(behind) < 4 or any(_NO_QUATERNION.search(name) for name in behind)
 
 
-def _to_metres(cells: Sequence[str]) -> float:
-    """Return the factor to metres of the unit that a header states of a position.
+def _to_metres(cells: Sequence[str]) -> tuple[float, tuple[str, ...]]:
+    """Return the factor to metres of the unit that a header states of a position, and notes.
 
     Raises:
-        DataError: it states several.
+        DataError: it states several, or one that is not read.
     """
+    for cell in cells:
+        unread = unread_length(cell)
+        if unread is not None:
+            raise DataError(
+                f"its header states positions in {unread!r} ({', '.join(cells)}), which is not read; "
+                "convert them to metres"
+            )
     stated = {factor_of(cell, LENGTH_UNITS) for cell in cells} - {None}
     if len(stated) > 1:
         raise DataError(
             f"its header states several units of the position ({', '.join(cells)}); write all in one"
         )
-    return next(iter(stated), None) or 1.0
+    factor = next(iter(stated), None)
+    named = ", ".join(cells)
+    if factor is None:
+        words = [word for cell in cells if (word := unknown_unit(cell, LENGTH_UNITS))]
+        if not words or words[0].isdigit():
+            return 1.0, ()
+        return 1.0, (f"doubtful: the unit {words[0]!r} of {named} is not known; read as metres",)
+    if factor == 1.0:
+        return 1.0, ()
+    return factor, (f"the positions {named} are converted to metres, by {factor:g}",)
 
 
-def _name_of(cell: str) -> str:
+def _letters(name: str) -> str:
     """Return the letters of a column's name, without the names of frames behind a component."""
-    of_frames = _OF_FRAMES.fullmatch(cell.strip())
-    return re.sub(r"[^a-z]", "", cell if of_frames is None else of_frames[1])
+    return re.sub(r"[^a-z]", "", _without_frames(name))
 
 
-def _stamp_column(names: Sequence[str]) -> int:
-    """Return the column of the times; that of a message goes before that of its recording."""
+def _without_frames(name: str) -> str:
+    of_frames = _OF_FRAMES.fullmatch(name.strip())
+    return name if of_frames is None else of_frames[1]
+
+
+def _stamp_column(names: Sequence[str]) -> int | None:
+    """Return the column of the times; that of a message goes before that of its recording. None:
+    none is named.
+    """
     times = [k for k, name in enumerate(names) if _is_time(name)]
     of_messages = [k for k in times if "headerstamp" in names[k]]
-    return next(iter(of_messages + times), 0)
+    return next(iter(of_messages + times), None)
 
 
 def _is_time(name: str) -> bool:
@@ -282,18 +360,47 @@ def _is_time(name: str) -> bool:
     )
 
 
-def _components(names: Sequence[str], form: re.Pattern[str], wanted: str) -> list[int] | None:
-    """Return the columns of components, each of which is named once; None: they are not."""
-    columns: dict[str, int] = {}
-    for k, name in enumerate(names):
-        match = form.fullmatch(name)
-        if match is not None and name:
-            columns.setdefault(match[1] or match[2], k)
-        elif name == "w" and "w" in wanted:
-            columns.setdefault("w", k)
-    if set(columns) >= set(wanted):
-        return [columns[c] for c in wanted]
-    return None
+def _components(
+    names: Sequence[str], stems: Sequence[str], wanted: str
+) -> dict[str, Sequence[int]]:
+    """Return the columns of components, by what stands before their letters (nothing: they are
+    bare), in the order of the names; all of one quantity have the same there, but for a bare w.
+
+    Args:
+        names: of columns, without units.
+        stems: words of which one is enough, whatever names of frames stand beside it.
+        wanted: the letters of the components.
+    """
+    found: dict[str, dict[str, int]] = {}
+    words = [_words_of(name) for name in names]
+    for k, parts in enumerate(words):
+        if not parts or parts[-1][-1] not in wanted or _OF_A_POSITION & set(parts):
+            continue
+        before = [part for part in (*parts[:-1], parts[-1][:-1]) if part]
+        columns = found.setdefault(_stem(before, stems), {})
+        of_same = columns.setdefault(parts[-1][-1], k)
+        if len("".join(words[of_same])) > len("".join(parts)):  # of a reference, or an estimate
+            columns[parts[-1][-1]] = k
+    bare_w = {c: k for c, k in found.get("", {}).items() if c == "w"}
+    whole = {stem: {**bare_w, **columns} for stem, columns in found.items()}
+    return {
+        stem: [columns[c] for c in wanted]
+        for stem, columns in whole.items()
+        if set(columns) >= set(wanted)
+    }
+
+
+def _words_of(name: str) -> list[str]:
+    """Return the words of a column's name; behind a bracket that another column closes."""
+    return re.findall(r"[a-z]+", re.sub(r".*[\[(]", "", _without_frames(name)))
+
+
+def _stem(before: Sequence[str], stems: Sequence[str]) -> str:
+    """Return the word of these stems in what stands before a component, else all of it."""
+    joined = "".join(before)
+    known = [word for word in before if word in stems]
+    known += [stem for stem in stems if len(stem) > 2 and joined.endswith(stem)]
+    return known[0] if known else joined
 
 
 def _order_in(text: str) -> str | None:

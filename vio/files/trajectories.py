@@ -153,6 +153,8 @@ def read_trajectory(
         return _matrices(table, body)
     table = _without_repeats(table)
     columns = named or _unnamed(table, w_first=kind == "euroc")
+    for note in columns.notes:
+        logger.warning("%s: %s", table.path, note)
     table = _without_lost(table, columns)
     times_ns = _times_ns(table, columns, kind)
     poses, orientations = _quaternion_poses(table, columns, kind)
@@ -176,9 +178,18 @@ def _named(table: _Table) -> PoseColumns | None:
     if count < _MIN_COLUMNS:
         return None
     try:
-        return named_columns(table.comments, count, w_first=table.commas)
+        named = named_columns(table.comments, count, w_first=table.commas)
     except DataError as error:
         raise DataError(f"{table.path}: {error}") from error
+    return None if named is None or _are_of_matrices(table, named) else named
+
+
+def _are_of_matrices(table: _Table, named: PoseColumns) -> bool:
+    """Return whether a header that names a position names elements of matrices beside it."""
+    count = len(table.fields(0))
+    if count not in _MATRIX_COLUMNS or named.quaternion is not None:
+        return False
+    return not named.names_stamp or (count in _LED_COLUMNS and not table.commas)
 
 
 def _unnamed(table: _Table, *, w_first: bool) -> PoseColumns:

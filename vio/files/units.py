@@ -47,6 +47,36 @@ LENGTH_UNITS: Mapping[str, float] = {
     **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1e-3),
     **dict.fromkeys(("km", "kilometer", "kilometers", "kilometre", "kilometres"), 1e3),
 }
+# Units of length that are not read; they stand behind names.
+UNREAD_LENGTHS = frozenset(
+    (
+        *(
+            "ft",
+            "foot",
+            "feet",
+            "in",
+            "inch",
+            "inches",
+            "yd",
+            "yard",
+            "yards",
+            "mi",
+            "mile",
+            "miles",
+        ),
+        *(
+            "um",
+            "micron",
+            "microns",
+            "micrometer",
+            "micrometers",
+            "micrometre",
+            "micrometres",
+            "nm",
+        ),
+        *("dm", "decimeter", "decimeters", "decimetre", "decimetres"),
+    )
+)
 _BRACKETS = re.compile(r"[\[({<]\s*((?:[^\[\](){}<>]|[({][^(){}]*[)}])*?)\s*[\])}>]")
 # a number with a decimal comma, or with no decimals
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+(?:,\d*)?(?:[eE][+-]?\d+)?")
@@ -175,6 +205,13 @@ def unknown_unit(cell: str, units: Mapping[str, float]) -> str | None:
     words = _in_brackets(cell)
     unknown = [word for word in words if word and word not in units and word not in "xyz012"]
     return unknown[0] if unknown else None
+
+
+def unread_length(cell: str) -> str | None:
+    """Return the unit of length that a cell states and that is not read; None: it states none."""
+    text = cell.strip().lower()
+    tails = (_plain(tail) for tail in _tails(_BRACKETS.sub("", text).strip()))
+    return next((word for word in (*_in_brackets(text), *tails) if word in UNREAD_LENGTHS), None)
 
 
 def without_unit(cell: str, units: Collection[str] = _OF_READINGS) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from vio.cameras.rig import Rig
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.plausible import checked_rig
-from vio.datasets.rigs.source import ImuSheet, Source, rig_of_poses
+from vio.datasets.rigs.source import ImuSheet, Source, first_cameras, rig_of_poses
 from vio.datasets.yaml_files import Entries, as_number, numbers, section, tool_lens
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, simplest_lens
@@ -44,19 +44,19 @@ def read(source: Source) -> Rig:
     """
     where = source.where
     block = section(source.entries, "value0", where)
-    poses = [_pose(item, where) for item in _list(block, "T_imu_cam", where)]
+    placed = _list(block, "T_imu_cam", where)
+    poses = [_pose(item, where) for item in first_cameras(placed, where)]
     lenses = _list(block, "intrinsics", where)
     sizes = _list(block, "resolution", where)
-    if not len(poses) == len(lenses) == len(sizes):
+    if not len(placed) == len(lenses) == len(sizes):
         raise CalibrationError(f"{where}: T_imu_cam, intrinsics and resolution differ in length")
     cameras = [
         _camera(lens, size, f"{where}, camera {k}")
-        for k, (lens, size) in enumerate(zip(lenses[:2], sizes, strict=False))
+        for k, (lens, size) in enumerate(zip(first_cameras(lenses, where), sizes, strict=False))
     ]
-    rig = rig_of_poses(cameras, poses, where, _imu(block, where))
-    if len(poses) > 2:
-        rig = rig.noting(f"{where}: of {len(poses)} cameras the first two are used")
-    return checked_rig(rig, where)
+    return checked_rig(
+        rig_of_poses(cameras, poses, where, _imu(block, where), count=len(placed)), where
+    )
 
 
 def _camera(lens: Mapping[str, Any], size: Sequence[float], where: str) -> CameraModel:

@@ -2,7 +2,7 @@
 
 `transform`, 3 x 4, maps coordinates of a camera to the rig, both with y up and z backwards as in
 OpenGL; metres. Lens models: `pinhole`, `fisheye` (k1 to k4 of OpenCV), `brown` (k1 k2 k3 p1 p2) and
-`polynomial` (OpenCV's k1 k2 p1 p2 k3 k4 k5 k6). The IMU's pose is not read.
+`polynomial` (OpenCV's k1 k2 p1 p2 k3 k4 k5 k6); `fisheye4` is another name of `fisheye`. The IMU's pose is not read.
 Reference: cuVSLAM's documentation, EDEX File Format and Distortion Models.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from vio.cameras.rig import Rig
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.plausible import checked_rig
-from vio.datasets.rigs.source import Source, rig_of_poses
+from vio.datasets.rigs.source import Source, first_cameras, rig_of_poses
 from vio.datasets.yaml_files import Entries, matrix, numbers, section
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel, simplest_lens
@@ -27,6 +27,7 @@ SUFFIX = ".edex"
 _LENSES: dict[str, tuple[DistortionModel, tuple[int, ...]]] = {
     "pinhole": ("pinhole", ()),
     "fisheye": ("equidistant", (0, 1, 2, 3)),
+    "fisheye4": ("equidistant", (0, 1, 2, 3)),
     "equidistant": ("equidistant", (0, 1, 2, 3)),
     "brown": ("radtan", (0, 1, 3, 4, 2)),
     "brown5k": ("radtan", (0, 1, 3, 4, 2)),
@@ -54,9 +55,10 @@ def read(source: Source) -> Rig:
     """
     where = source.where
     items: list[Any] = source.entries["cameras"]  # type: ignore[assignment]
-    cameras = [_camera(item, f"{where}, camera {k}") for k, item in enumerate(items)]
-    poses = [_pose(item, f"{where}, camera {k}") for k, item in enumerate(items)]
-    rig = rig_of_poses(cameras, poses, where)
+    read_items = first_cameras(items, where)
+    cameras = [_camera(item, f"{where}, camera {k}") for k, item in enumerate(read_items)]
+    poses = [_pose(item, f"{where}, camera {k}") for k, item in enumerate(read_items)]
+    rig = rig_of_poses(cameras, poses, where, count=len(items))
     if "imu" in source.entries:
         rig = rig.noting(
             f"{where}: the pose of its IMU is not read; give T_cam0_imu.txt to use the IMU"
@@ -72,7 +74,13 @@ def _camera(item: Mapping[str, Any], where: str) -> CameraModel:
             f"{where}: the lens model {name!r} is not read; known: {', '.join(_LENSES)}"
         )
     model, places = _LENSES[name]
-    given = numbers(lens, "distortion_params", where) if places else ()
+    stated = lens.get("distortion_params") or []
+    given = numbers({"distortion_params": stated}, "distortion_params", where)
+    if not places and any(given):
+        raise CalibrationError(
+            f"{where}: states distortion_params, which a pinhole does not have; name the "
+            "distortion_model they are of"
+        )
     if len(given) < len(places):
         raise CalibrationError(
             f"{where}: {name} has {len(places)} distortion_params, not {len(given)}"

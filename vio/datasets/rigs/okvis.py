@@ -70,10 +70,8 @@ def read(source: Source) -> Rig:
         else:
             cameras.append(_ncamera(section(item, "camera", here), here))
             poses.append(_body_pose(item, here))
-    rig = rig_of_poses(cameras, poses, where, _imu(source.entries, where))
-    if len(items) > 2:
-        rig = rig.noting(f"{where}: of {len(items)} cameras the first two are used")
-    return checked_rig(rig, where)
+    imu = _imu(source.entries, where)
+    return checked_rig(rig_of_poses(cameras, poses, where, imu, count=len(items)), where)
 
 
 def _items(entries: Entries) -> list[Any]:

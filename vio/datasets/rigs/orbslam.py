@@ -9,7 +9,7 @@ Old: `Camera.fx … Camera.bf`, `Camera2.fx …` with `Tlr`, or `LEFT.K … RIGH
 baseline, pixels times metres. Neither form has a time shift. Noise: densities in SI units.
 OpenVSLAM names it `Camera.focal_x_baseline`, the size `Camera.cols` and `Camera.rows`, and the lens
 `Camera.model`; stella_vslam has them in a block `Camera:`, and raw images where there is a block
-`StereoRectifier:`.
+`StereoRectifier:`; with `Camera.setup: RGBD`, the depths' levels per metre are `depthmap_factor`.
 Reference: ORB-SLAM3's `Settings.cc` and `Tracking.cc`, and its document Calibration_Tutorial;
 stella_vslam's documentation, Parameters.
 """
@@ -78,6 +78,12 @@ def _in_its_names(entries: Entries) -> Entries:
             named.setdefault(name, named[key])
     model = str(named["Camera.model"]).lower()
     named["Camera.type"] = _LENSES_OF_STELLA.get(model, model)
+    setup = str(named.get("Camera.setup", "stereo")).lower()
+    if setup in ("monocular", "rgbd"):  # the baseline is that of a depth camera's projector
+        named.pop("Camera.bf", None)
+        if setup == "rgbd":
+            named["RGBD.DepthMapFactor"] = _depthmap_factor(named)
+        return named
     rectifier = entries.get("StereoRectifier")
     if isinstance(rectifier, dict) and "K_left" in rectifier:
         size = {"width": named.get("Camera.width"), "height": named.get("Camera.height")}
@@ -98,6 +104,14 @@ def _in_its_names(entries: Entries) -> Entries:
             "Camera.bf": bf,
         }
     return named
+
+
+def _depthmap_factor(named: Entries) -> object:
+    """Return what states the levels per metre of depth images, which is in a block or in none."""
+    block = named.get("Preprocessing")
+    if isinstance(block, dict) and "depthmap_factor" in block:
+        return block["depthmap_factor"]
+    return named.get("depthmap_factor", named.get("Camera.depthmap_factor"))
 
 
 def _cameras(source: Source) -> Rig:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -99,11 +100,28 @@ def _beside(T_cam1_cam0: FloatArray) -> float:
     return float(position[0]) / length if length > 0 else 0.0
 
 
+def first_cameras(items: Sequence[object], where: str) -> list[dict[str, Any]]:
+    """Return the blocks of the first two cameras of a list, or of the only one; what further ones are
+    is not read.
+
+    Raises:
+        CalibrationError: one is no block.
+    """
+    for k, item in enumerate(items[:2]):
+        if not isinstance(item, dict):
+            raise CalibrationError(
+                f"{where}, camera {k}: is {item!r:.40}, no block of entries; copy the calibration again"
+            )
+    return [item for item in items[:2] if isinstance(item, dict)]
+
+
 def rig_of_poses(
     cameras: Sequence[CameraModel],
     T_imu_cams: Sequence[FloatArray],
     where: str,
     imu: ImuSheet | None = None,
+    *,
+    count: int | None = None,
 ) -> Rig:
     """Return the rig of one camera or of the first two, mounted on an IMU.
 
@@ -112,6 +130,7 @@ def rig_of_poses(
         T_imu_cams: (4, 4) each, map coordinates of the camera to the IMU.
         where: the file, for messages.
         imu: what is known of the IMU; None: there is none, the poses are on some body.
+        count: of the cameras of the file, where not all are given.
 
     Raises:
         CalibrationError: there is no camera.
@@ -119,8 +138,9 @@ def rig_of_poses(
     if not cameras:
         raise CalibrationError(f"{where}: holds no camera; copy the calibration again")
     notes = imu.notes if imu is not None else ()
-    if len(cameras) > 2:
-        notes = (*notes, f"{where}: of {len(cameras)} cameras the first two are used")
+    count = count or len(cameras)
+    if count > 2:
+        notes = (*notes, f"{where}: of {count} cameras the first two are used")
     known = imu or ImuSheet()
     T_cam0_imu = se3_inverse(T_imu_cams[0])
     body = T_cam0_imu if imu is not None else None

@@ -13,7 +13,7 @@ from typing import Any
 from vio.cameras.rig import Rig
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.plausible import checked_rig
-from vio.datasets.rigs.source import ImuSheet, Source, no_image_size, rig_of_poses
+from vio.datasets.rigs.source import ImuSheet, Source, first_cameras, no_image_size, rig_of_poses
 from vio.datasets.yaml_files import Entries, matrix, numbers
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel, simplest_lens
@@ -42,9 +42,11 @@ def read(source: Source) -> Rig:
     """
     where = source.where
     items: list[Any] = source.entries["cameras"]  # type: ignore[assignment]
-    cameras = [_camera(item, source, f"{where}, camera {k}") for k, item in enumerate(items)]
-    poses = [_pose(item, f"{where}, camera {k}") for k, item in enumerate(items)]
-    return checked_rig(rig_of_poses(cameras, poses, where, ImuSheet()), where)
+    read_items = first_cameras(items, where)
+    cameras = [_camera(item, source, f"{where}, camera {k}") for k, item in enumerate(read_items)]
+    poses = [_pose(item, f"{where}, camera {k}") for k, item in enumerate(read_items)]
+    rig = rig_of_poses(cameras, poses, where, ImuSheet(), count=len(items))
+    return checked_rig(rig, where)
 
 
 def _camera(item: Mapping[str, Any], source: Source, where: str) -> CameraModel:
