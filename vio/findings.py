@@ -276,7 +276,7 @@ CODES: dict[str, Code] = {
     "imu-gap": Code("degraded", "no IMU sample came for some time", "check the IMU's driver"),
     "imu-readings": Code(
         "degraded",
-        "IMU samples are spikes, repeat to the last bit, or an axis is dead",
+        "IMU samples are spikes or stuck, or an axis is dead",
         "check the IMU's driver",
     ),
     "imu-not-used": Code(
