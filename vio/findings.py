@@ -275,7 +275,9 @@ CODES: dict[str, Code] = {
     "no-pose": Code("nominal", "frames have no pose: the state was not observable yet", ""),
     "imu-gap": Code("degraded", "no IMU sample came for some time", "check the IMU's driver"),
     "imu-readings": Code(
-        "degraded", "IMU samples are spikes, repeat to the last bit, or an axis is dead", "check the IMU's driver"
+        "degraded",
+        "IMU samples are spikes, repeat to the last bit, or an axis is dead",
+        "check the IMU's driver",
     ),
     "imu-not-used": Code(
         "degraded",
