@@ -166,7 +166,8 @@ def _thin(image: Image, right: int = 0) -> FloatArray:
 def _by_cell(thin: FloatArray) -> FloatArray:
     """Values (N, K) of the cells of an image by its values at some pixels (h, w)."""
     size = _STILL.cell_px // _STILL.stride_px
-    rows, columns = thin.shape[0] // size, thin.shape[1] // size
+    rows = thin.shape[0] // size
+    columns = thin.shape[1] // size
     parts = thin.reshape(rows, size, columns, size).swapaxes(1, 2)
     return parts.reshape(rows * columns, size * size)
 
