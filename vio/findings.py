@@ -201,7 +201,7 @@ CODES: dict[str, Code] = {
     "frame-refused": Code("degraded", "the front end refused a frame", "see the message"),
     "frames-missing": Code("degraded", "no frame came for some time", _CAMERA),
     "frames-out-of-order": Code(
-        "unusable", "images are not in the order of their exposures", "order them by stamps"
+        "unusable", "images are not ordered by exposure", "order them by stamps"
     ),
     "frames-repeated": Code("degraded", "frames or rows show an earlier exposure again", _CAMERA),
     "images-held": Code(

@@ -31,7 +31,7 @@ def _in_blocks(block: tuple[int, ...], begin: int, end: int) -> FloatArray:
     return _path()[order]
 
 
-@pytest.mark.parametrize("block", [(1, 0), (2, 1, 0, 3), (0, 2, 1)])
+@pytest.mark.parametrize("block", [(1, 0), (2, 1, 0, 3), (0, 2, 1), (3, 2, 1, 0)])
 def test_frames_in_another_order_are_named(block: tuple[int, ...]) -> None:
     begun, ended = _found(_in_blocks(block, 12, 36))
     assert begun.effect == "unusable"
@@ -57,3 +57,51 @@ def test_paths_that_are_rough_in_any_order_are_not_named() -> None:
         assert _found(path + shaken) == []
     assert _found(np.vstack([path, path[::-1]])) == []
     assert _found(np.zeros((FRAMES, 3))) == []
+
+
+def _shaken(low_hz: float, high_hz: float, seed: int) -> FloatArray:
+    """Positions (N, 3) at 20 Hz of a rig that is shaken by 4 cm at random, mostly along one axis."""
+    rng = np.random.default_rng(seed)
+    frames = 400
+    hz = np.fft.rfftfreq(frames, 1.0 / 20.0)
+    within = (hz > low_hz) & (hz < high_hz)
+    spectrum = np.where(
+        within, rng.normal(size=(3, len(hz))) + 1j * rng.normal(size=(3, len(hz))), 0.0
+    )
+    motion = np.fft.irfft(spectrum, frames).T
+    noise = rng.normal(0.0, 0.0005, (frames, 3))
+    return 0.04 * motion / motion.std(axis=0) * np.array([1.0, 0.05, 0.05]) + noise
+
+
+@pytest.mark.parametrize("band", [(3.5, 6.0), (4.0, 5.0), (5.0, 7.0), (7.0, 8.0)])
+def test_a_rig_that_is_shaken_at_random_is_not_named(band: tuple[float, float]) -> None:
+    assert [finding for seed in range(8) for finding in _found(_shaken(*band, seed))] == []
+
+
+def test_it_ends_at_rest_though_noise_goes_back_and_forth() -> None:
+    path = _in_blocks((1, 0), 12, FRAMES)
+    rng = np.random.default_rng(1)
+    begun, ended = _found(np.vstack([path, path[-1] + rng.normal(0.0, 5e-4, (60, 3))]))
+    assert begun.lasts
+    assert ended.ended
+    assert ended.frame == pytest.approx(FRAMES + 20, abs=2)
+
+
+def test_it_ends_once_the_path_is_smooth_in_no_other_order() -> None:
+    """A rig that is shaken after the fault goes back and forth as well."""
+    path = _in_blocks((1, 0), 12, FRAMES)
+    begun, ended = _found(np.vstack([path, path[-1] + _shaken(4.0, 5.0, 0)[:100]]))
+    assert begun.lasts
+    assert ended.ended
+    assert ended.frame is not None
+    assert ended.frame <= FRAMES + 60
+
+
+@pytest.mark.parametrize(("innovation", "named"), [(1.9, False), (2.1, True), (None, True)])
+def test_nothing_is_said_where_a_motion_sensor_agrees(
+    innovation: float | None, named: bool
+) -> None:
+    check = FrameOrder()
+    positions = _in_blocks((1, 0), 12, 48)
+    found = [f for k, p in enumerate(positions) for f in check.frame(k, p, innovation)]
+    assert bool(found) == named

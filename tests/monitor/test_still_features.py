@@ -40,6 +40,17 @@ def _rain(k: int, rng: np.random.Generator) -> np.ndarray:
     return view
 
 
+def _flickering(k: int, depth: float) -> np.ndarray:
+    """A lamp of 100 Hz, at 30 Hz and a readout of 20 ms."""
+    row = np.arange(HEIGHT)[:, None] / HEIGHT
+    return _passing(0, 0.0) * (1.0 + depth * np.sin(2.0 * np.pi * 100.0 * (k / 30.0 + 0.02 * row)))
+
+
+def _bracketed(k: int, gain: float) -> np.ndarray:
+    """A bright view whose exposure changes from frame to frame."""
+    return np.clip((30.0 + _passing(0, 0.0)) * (gain if k % 2 else 1.0), 0.0, 255.0)
+
+
 def _found(
     view: View, frames: int = 20, flow_px: float | None = 0.2, moves_from: int = 99
 ) -> list[Finding]:
@@ -69,15 +80,27 @@ def test_features_that_move_end_it() -> None:
     assert ended.frame == 14
 
 
+def test_a_view_that_stays_ends_it() -> None:
+    begun, ended = _found(lambda k, rng: _passing(min(k, 12), 1.0), frames=40)
+    assert not begun.ended
+    assert ended.ended
+    assert ended.frame is not None
+    assert 12 < ended.frame <= 12 + 15
+
+
 @pytest.mark.parametrize(
     "view",
     [
         lambda k, rng: _passing(0, 0.0),
         lambda k, rng: _passing(0, 0.0) * (0.6 + 0.4 * (k % 2)) + 10.0 * (k % 3),
         lambda k, rng: _passing(k, 0.4),
+        lambda k, rng: _flickering(k, 0.05),
+        lambda k, rng: _flickering(k, 0.2),
+        lambda k, rng: _bracketed(k, 1.5),
+        lambda k, rng: _passing(0, 0.0) + rng.normal(0.0, 20.0, (HEIGHT, WIDTH)),
         _rain,
     ],
-    ids=["noise", "exposure", "object", "rain"],
+    ids=["noise", "exposure", "object", "flicker", "lamp", "bracketed", "night", "rain"],
 )
 def test_a_rig_at_standstill_is_not_named(view: View) -> None:
     assert _found(view) == []

@@ -7,7 +7,8 @@ stopped at once. By images alone, a rig that crept and did not slow down may hav
 frames are left out, and nothing is said of them. Nearly equal
 pairs (encoded again, or with noise on top) are the same where the tracked corners have not moved,
 while the motion predicted since the last frame moves them by more than its uncertainty allows and
-the IMU is not at standstill, or while single frames have shown no motion again and again. A rig at
+the IMU is not at standstill, or while single frames have shown no motion again and again, each with
+twice the motion of its neighbours after it. A rig at
 standstill gives nearly equal images, too; there the prediction agrees, and they are used.
 """
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -60,11 +62,15 @@ class _FlowRules(NamedTuple):
     unmoved_px: float = 0.15  # the flow of an unmoved corner under noise of a few gray levels
     unmoved_share: float = 0.8  # of the corners that must be unmoved
     first_rows: Capacity[int] = 8  # compared before all others
-    # The newest, at most and at least, of which so many have not moved, each between two that have:
-    # no rig stops for a frame so often, and those come twice.
+    # The newest, at most and at least, of which so many have not moved, each between two that have …
     twice_frames: int = 12
     min_twice_frames: int = 8
     min_paused: int = 3
+    # … and of which so large a share is followed by a motion on the same way so many times that of
+    # the frames beside it, as the motion goes on unseen meanwhile. Repetitions come to 2; a rig that
+    # stops for a frame comes to 1, one that turns back to -1.
+    jump: float = 1.6
+    jumping_share: float = 0.6
 
 
 _FLOW = _FlowRules()
@@ -98,6 +104,15 @@ class _StillNoise(NamedTuple):
 _STILL = _StillNoise()
 
 
+class _Flow(NamedTuple):
+    """Motion of the features since the frame before."""
+
+    frame: int  # its number
+    px: float | None  # median; 0: the frame repeats the one before, None: they share too few
+    # Along the last motion before, over that one (median of the features); None: not known.
+    advance: float | None
+
+
 @dataclass(frozen=True, slots=True)
 class Repeated:
     """A pair that shows the exposure of an earlier frame."""
@@ -126,9 +141,9 @@ class FrozenImages:
         self._deep: StereoFrame | None = None
         self._same_depth = False  # that of the frame before was one
         self._expected: Prediction | None = None  # of the present frame
-        # flow (median) of each frame, in pixels; none where it repeats the one before
-        self._flows = deque[float](maxlen=_FLOW.twice_frames)
-        self._flow_indices = deque[int](maxlen=_FLOW.twice_frames)  # of these frames
+        self._flows = deque[_Flow](maxlen=_FLOW.twice_frames)
+        # features and their motion (N, 2) in the last frame in which they moved
+        self._last_motion: tuple[IntArray, FloatArray] | None = None
         # median error of each frame's predicted pixels
         self._errors_px: deque[float] = deque(maxlen=_FLOW.recent_frames)
 
@@ -151,10 +166,11 @@ class FrozenImages:
         self._seen_first = self._seen_before
         before = self._seen_before = self._seen
         self._seen = seen
-        self._add_flow(seen.frame_index, self._flow_px())
+        flow_px = self._flow_px()
+        self._add_flow(seen.frame_index, flow_px)
         if self._ended_still is not None and before is not None and len(before):
             since, before_px = self._ended_still
-            begun = self._flows[-1] > max(_BEGUN.min_px, _BEGUN.factor * before_px)
+            begun = (flow_px or 0.0) > max(_BEGUN.min_px, _BEGUN.factor * before_px)
             if begun or np.isin(before.ids, seen.ids).mean() < _BEGUN.lost_share:
                 self._held_since = since
         self._ended_still = None
@@ -173,26 +189,37 @@ class FrozenImages:
             self._add_flow(frame.index, 0.0)
         return self._repeating
 
-    def _add_flow(self, index: int, flow_px: float) -> None:
-        self._flows.append(flow_px)
-        self._flow_indices.append(index)
+    def _add_flow(self, index: int, flow_px: float | None) -> None:
+        """Add the flow of a frame, whose features are `_seen` unless it repeats the one before."""
+        if flow_px is None or flow_px < _FLOW.unmoved_px:
+            self._flows.append(_Flow(index, flow_px, None))
+            return
+        assert self._seen is not None
+        assert self._seen_before is not None
+        a, b = shared_rows(self._seen_before.ids, self._seen.ids)
+        ids = self._seen.ids[b]
+        motion = self._seen.z[b, :2] - self._seen_before.z[a, :2]
+        advance = None
+        if self._last_motion is not None:
+            last_ids, last = self._last_motion
+            a, b = shared_rows(last_ids, ids)
+            squared = (last[a] ** 2).sum(axis=1)
+            along = (motion[b] * last[a]).sum(axis=1)[squared > 0.0]
+            if len(along) >= _FLOW.min_corners:
+                advance = median(along / squared[squared > 0.0])
+        self._last_motion = ids, motion
+        self._flows.append(_Flow(index, flow_px, advance))
 
-    def _flow_px(self) -> float:
+    def _flow_px(self) -> float | None:
         """Flow of the features between the two frames before the present one (median)."""
         if self._seen is None or self._seen_before is None:
-            return 0.0
+            return None
         return _median_flow_px(self._seen_before, self._seen)
 
     @property
     def flow_px(self) -> float | None:
         """Median flow of the features of the present frame; None: the last two share too few."""
-        if self._seen is None or self._seen_before is None:
-            return None
-        return (
-            self._flows[-1]
-            if min(len(self._seen), len(self._seen_before)) >= _FLOW.min_corners
-            else None
-        )
+        return self._flows[-1].px if self._flows else None
 
     def take_held(self) -> int | None:
         """Return the first of the equal frames that were taken for a rig at standstill, and were
@@ -241,7 +268,7 @@ class FrozenImages:
         if self._crept < _FLOW.max_crept and self._creeps():
             self._crept += 1
             return Repeated(shown.index, True, certain=False)
-        self._still = self._still or (frame.index, self._flow_px())
+        self._still = self._still or (frame.index, self._flow_px() or 0.0)
         return None
 
     def _judge_changed(
@@ -257,27 +284,29 @@ class FrozenImages:
         is_expected = self._repeating is not None and self._repeating.certain
         if is_expected or since is not None:
             frozen = _unmoved(shown, frame, self._seen)
+            if not is_expected:
+                frozen = frozen and not self._at_standstill()
         else:
             frozen = self._has_stopped(frame, shown, self._seen, expected)
         return Repeated(shown.index, False, since=since) if frozen else None
 
     def _paused_since(self) -> int | None:
-        """The first of single frames that have not moved, among others that have, as the last one has;
-        None: there are few, or frames that may be either.
+        """The first of single frames that have not moved, among others that have, as the last one has,
+        with a jump after most of them; None: there are few, or frames that may be either.
         """
-        flows = self._flows
-        if len(flows) < _FLOW.min_twice_frames or flows[-1] <= _FLOW.moved_px:
+        flows = list(self._flows)
+        if len(flows) < _FLOW.min_twice_frames or flows[-1].px is None or _pauses(flows[-1]):
             return None
-        paused: list[int] = []
-        last_paused = False
-        for index, flow_px in zip(self._flow_indices, flows, strict=True):
-            pauses = flow_px < _FLOW.unmoved_px
-            if (pauses and last_paused) or (not pauses and flow_px <= _FLOW.moved_px):
-                return None
-            if pauses:
-                paused.append(index)
-            last_paused = pauses
-        return paused[0] if len(paused) >= _FLOW.min_paused else None
+        paused = [k for k, flow in enumerate(flows) if _pauses(flow)]
+        unclear = any(
+            flow.px is not None and _FLOW.unmoved_px <= flow.px <= _FLOW.moved_px for flow in flows
+        )
+        if unclear or any(after - k == 1 for k, after in pairwise(paused)):
+            return None
+        jumps = sum(_jumps_after(flows, k) for k in paused)
+        if jumps < max(_FLOW.min_paused, _FLOW.jumping_share * len(paused)):
+            return None
+        return flows[paused[0]].frame
 
     def _has_stopped(
         self, frame: StereoFrame, shown: StereoFrame, seen: Observations, expected: Prediction
@@ -294,7 +323,7 @@ class FrozenImages:
         """Whether the rig moves: by the last frames' features, the IMU's samples, else by the
         prediction.
         """
-        if self._flow_px() > _FLOW.moved_px:
+        if (self._flow_px() or 0.0) > _FLOW.moved_px:
             return True
         if self._imu:
             return not self._at_standstill()
@@ -308,6 +337,8 @@ class FrozenImages:
             return False
         now_px = self._flow_px()
         before_px = _median_flow_px(self._seen_first, self._seen_before)
+        if now_px is None or before_px is None:
+            return False
         return min(now_px, 2.0 * now_px - before_px) > _FLOW.crept_px
 
     def _at_standstill(self) -> bool:
@@ -347,10 +378,30 @@ def _moved(before: Observations, now: Observations | TrackPrior) -> tuple[IntArr
     return a, lengths(now.z[b, :2] - before.z[a, :2])
 
 
-def _median_flow_px(before: Observations, now: Observations) -> float:
-    """Median flow of the features of two frames in the left image; 0: they share too few."""
+def _median_flow_px(before: Observations, now: Observations) -> float | None:
+    """Median flow of the features of two frames in the left image; None: they share too few."""
     _, moved_px = _moved(before, now)
-    return median(moved_px) if len(moved_px) >= _FLOW.min_corners else 0.0
+    return median(moved_px) if len(moved_px) >= _FLOW.min_corners else None
+
+
+def _pauses(flow: _Flow) -> bool:
+    """Whether features have not moved in a frame."""
+    return flow.px is not None and flow.px < _FLOW.unmoved_px
+
+
+def _jumps_after(flows: Sequence[_Flow], paused: int) -> bool:
+    """Whether the frame after a pause moves more than those beside it on the same way; where each
+    of them comes after a pause as well, as much.
+    """
+    after = flows[paused + 1].advance
+    before_px = flows[paused - 2].px if paused >= 2 else None
+    is_plain_before = before_px is not None and before_px >= _FLOW.unmoved_px
+    if after is None or after < (_FLOW.jump if is_plain_before else 1.0 / _FLOW.jump):
+        return False
+    if paused + 2 >= len(flows) or _pauses(flows[paused + 2]):
+        return True
+    next_one = flows[paused + 2].advance
+    return next_one is not None and 0.0 < next_one < 1.0 / _FLOW.jump
 
 
 def _same_depths(a: FloatArray, b: FloatArray) -> bool:

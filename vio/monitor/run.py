@@ -385,7 +385,8 @@ class RunMonitor:
         """
         self._integrity.take_scale(measured=has_scale)
         self._add(self._health.frame(index, report, estimate))
-        self._add(self._order.frame(index, estimate.T_world_imu[:3, 3]))
+        innovation = report.innovation_ratio if measured else None
+        self._add(self._order.frame(index, estimate.T_world_imu[:3, 3], innovation))
         if self._contradiction is not None:
             self._add(self._contradiction.frame(index, report.innovation_ratio))
             self._integrity.take_innovation(report.innovation_ratio)
