@@ -104,7 +104,8 @@ class _StillNoise(NamedTuple):
 _STILL = _StillNoise()
 
 
-class _Flow(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class _Flow:
     """Motion of the features since the frame before."""
 
     frame: int  # its number
