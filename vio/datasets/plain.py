@@ -76,7 +76,7 @@ from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.records import IntArray, Trajectory
+from vio.records import Image, IntArray, Trajectory
 
 _PAIRS: tuple[tuple[str, ...], ...] = (
     ("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_00", "image_01"),
@@ -445,7 +445,10 @@ def read_mono(path: Path, settings: DatasetSettings) -> ImageDataset:
             "left/"
         )
     files = list_images(layout.left)
-    load = lambda k: load_gray(files[k])[0]  # noqa: E731
+
+    def load(k: int) -> Image:
+        return load_gray(files[k])[0]
+
     doubts = (alternating_note(len(files), load), halves_note(len(files), load))
     notes = (*_empty_partner_note(layout), *filter(None, doubts))
     images = _Images(FilePairs(files, files), notes)

@@ -49,33 +49,33 @@ LENGTH_UNITS: Mapping[str, float] = {
 }
 # Units of length that are not read; they stand behind names.
 UNREAD_LENGTHS = frozenset(
-    (
-        *(
-            "ft",
-            "foot",
-            "feet",
-            "in",
-            "inch",
-            "inches",
-            "yd",
-            "yard",
-            "yards",
-            "mi",
-            "mile",
-            "miles",
-        ),
-        *(
-            "um",
-            "micron",
-            "microns",
-            "micrometer",
-            "micrometers",
-            "micrometre",
-            "micrometres",
-            "nm",
-        ),
-        *("dm", "decimeter", "decimeters", "decimetre", "decimetres"),
-    )
+    {
+        "ft",
+        "foot",
+        "feet",
+        "in",
+        "inch",
+        "inches",
+        "yd",
+        "yard",
+        "yards",
+        "mi",
+        "mile",
+        "miles",
+        "um",
+        "micron",
+        "microns",
+        "micrometer",
+        "micrometers",
+        "micrometre",
+        "micrometres",
+        "nm",
+        "dm",
+        "decimeter",
+        "decimeters",
+        "decimetre",
+        "decimetres",
+    }
 )
 _BRACKETS = re.compile(r"[\[({<]\s*((?:[^\[\](){}<>]|[({][^(){}]*[)}])*?)\s*[\])}>]")
 # a number with a decimal comma, or with no decimals

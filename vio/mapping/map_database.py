@@ -59,7 +59,7 @@ class _StepLimits(NamedTuple):
 
 
 _LIMITS = _StepLimits()
-_BEGIN = b"SQLite format 3\0"  # of a map's file
+BEGIN = b"SQLite format 3\0"  # of a map's file
 APPLICATION_ID = 0x53564D50  # "SVMP" in the file's header
 _SCHEMA = """
 CREATE TABLE sessions (id INTEGER PRIMARY KEY, source TEXT NOT NULL, part INTEGER NOT NULL, upright INTEGER NOT NULL,
@@ -124,7 +124,7 @@ def _errors_of(path: Path) -> Iterator[None]:
 def damaged(path: Path, fault: object) -> DataError:
     """Return the error that says what is wrong with a map's file."""
     with contextlib.suppress(OSError), path.open("rb") as stream:
-        if stream.read(len(_BEGIN)) != _BEGIN:
+        if stream.read(len(BEGIN)) != BEGIN:
             return DataError(
                 f"{path}: is no map of this program, or its beginning is damaged; give a file that "
                 "vio run --map wrote"

@@ -18,7 +18,7 @@ from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures
-from vio.mapping.map_database import APPLICATION_ID, KEYS, SINCE, MapDatabase, damaged
+from vio.mapping.map_database import APPLICATION_ID, BEGIN, KEYS, SINCE, MapDatabase, damaged
 from vio.mapping.place_index import SEGMENT, Segment
 from vio.records import BoolArray, IntArray
 
@@ -88,9 +88,7 @@ def is_map(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         header = file.read(72)
-    return header.startswith(b"SQLite format 3\0") and header[68:] == APPLICATION_ID.to_bytes(
-        4, "big"
-    )
+    return header.startswith(BEGIN) and header[68:] == APPLICATION_ID.to_bytes(4, "big")
 
 
 class MapStore(MapDatabase):

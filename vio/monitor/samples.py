@@ -349,9 +349,8 @@ def _named_unit(usual: float, spread: float, seen: str) -> Size | None:
     }
     for gravity, explanation in units.items():
         if 0.6 < usual / gravity < 1.6:
-            factor = (
-                None if gravity == _MILLI_G else EARTH_GRAVITY_MPS2 / gravity
-            )  # of which there are two
+            # of mg there are two
+            factor = None if gravity == _MILLI_G else EARTH_GRAVITY_MPS2 / gravity
             finding = InertialFinding(
                 "accelerometer units", seen, f"the readings are {explanation}", factor=factor
             )
