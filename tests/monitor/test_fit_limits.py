@@ -476,10 +476,8 @@ def _has_stopped(frames: int) -> bool:
 
 def _creeps(px: float) -> bool:
     images = _frozen()
-    images._seen = images._seen_before = images._seen_first = observations(0, 0, [], [])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(frozen, "_median_flow_px", lambda *_: px)
-        return bool(images._creeps())
+    images._flow_px = images._flow_before_px = px
+    return bool(images._creeps())
 
 
 def _crept(frames: int) -> bool:
@@ -494,10 +492,10 @@ def _crept(frames: int) -> bool:
 def _has_begun(px: float) -> bool:
     """Whether a motion ends equal images after a flow of half a pixel."""
     images = _frozen()
+    ids = list(range(20))
+    images.observations(observations(0, 0, ids, np.ones((20, 4))))
     images._ended_still = 3, 0.5
-    images._seen = observations(0, 0, [1], np.ones((1, 4)))
-    images._flow_px = lambda: px
-    images.observations(observations(1, 1, [1], np.ones((1, 4))))
+    images.observations(observations(1, 1, ids, np.ones((20, 4)) + [px, 0.0, px, 0.0]))
     return images.take_held() is not None
 
 

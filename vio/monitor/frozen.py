@@ -124,6 +124,15 @@ class Repeated:
     since: int | None = None  # first frame of others like it, that were used; None: there are none
 
 
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """Motion in the left image of the features that two sets share."""
+
+    ids: IntArray  # (N,)
+    px: FloatArray  # (N, 2)
+    rows: IntArray  # (N,) of the first set
+
+
 class FrozenImages:
     """Compares each pair with the last one that showed something new."""
 
@@ -131,8 +140,9 @@ class FrozenImages:
         self._imu: list[ImuSample] = []  # the last half second
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
         self._seen: Observations | None = None  # its features
-        self._seen_before: Observations | None = None  # those of the frame before
-        self._seen_first: Observations | None = None  # those of the frame before that one
+        # median flow of them, and of those of the frame before; None: too few were seen twice
+        self._flow_px: float | None = None
+        self._flow_before_px: float | None = None
         self._crept = 0  # equal frames in a row that were left out as the rig crept
         self._still: tuple[int, float] | None = None  # first frame of equal ones, flow before it
         self._ended_still: tuple[int, float] | None = None  # with the present frame
@@ -143,8 +153,7 @@ class FrozenImages:
         self._same_depth = False  # that of the frame before was one
         self._expected: Prediction | None = None  # of the present frame
         self._flows = deque[_Flow](maxlen=_FLOW.twice_frames)
-        # features and their motion (N, 2) in the last frame in which they moved
-        self._last_motion: tuple[IntArray, FloatArray] | None = None
+        self._last_motion: _Motion | None = None  # in the last frame in which features moved
         # median error of each frame's predicted pixels
         self._errors_px: deque[float] = deque(maxlen=_FLOW.recent_frames)
 
@@ -161,19 +170,25 @@ class FrozenImages:
     def observations(self, seen: Observations) -> None:
         """Take the features of a frame that `check` let pass."""
         if self._expected is not None:
-            _, off_px = _moved(seen, self._expected.tracks)
-            if len(off_px):
-                self._errors_px.append(median(off_px))
-        self._seen_first = self._seen_before
-        before = self._seen_before = self._seen
+            off = _motion(seen, self._expected.tracks)
+            if len(off.ids):
+                self._errors_px.append(median(lengths(off.px)))
+        before = self._seen
         self._seen = seen
-        flow_px = self._flow_px()
-        self._add_flow(seen.frame_index, flow_px)
-        if self._ended_still is not None and before is not None and len(before):
-            since, before_px = self._ended_still
-            begun = (flow_px or 0.0) > max(_BEGUN.min_px, _BEGUN.factor * before_px)
-            if begun or np.isin(before.ids, seen.ids).mean() < _BEGUN.lost_share:
-                self._held_since = since
+        advance = None
+        if before is not None:
+            motion = _motion(before, seen)
+            flow_px = median(lengths(motion.px)) if len(motion.ids) >= _FLOW.min_corners else None
+            self._flow_before_px = self._flow_px
+            self._flow_px = flow_px
+            if flow_px is not None and flow_px >= _FLOW.unmoved_px:
+                advance = self._advance(motion)
+            if self._ended_still is not None and len(before):
+                since, before_px = self._ended_still
+                begun = (flow_px or 0.0) > max(_BEGUN.min_px, _BEGUN.factor * before_px)
+                if begun or len(motion.ids) < _BEGUN.lost_share * len(before):
+                    self._held_since = since
+        self._flows.append(_Flow(seen.frame_index, self._flow_px, advance))
         self._ended_still = None
 
     def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
@@ -187,35 +202,23 @@ class FrozenImages:
         if self._repeating is None:
             self._shown = frame
         else:
-            self._add_flow(frame.index, 0.0)
+            self._flows.append(_Flow(frame.index, 0.0, None))
         return self._repeating
 
-    def _add_flow(self, index: int, flow_px: float | None) -> None:
-        """Add the flow of a frame, whose features are `_seen` unless it repeats the one before."""
-        if flow_px is None or flow_px < _FLOW.unmoved_px:
-            self._flows.append(_Flow(index, flow_px, None))
-            return
-        assert self._seen is not None
-        assert self._seen_before is not None
-        a, b = shared_rows(self._seen_before.ids, self._seen.ids)
-        ids = self._seen.ids[b]
-        motion = self._seen.z[b, :2] - self._seen_before.z[a, :2]
-        advance = None
-        if self._last_motion is not None:
-            last_ids, last = self._last_motion
-            a, b = shared_rows(last_ids, ids)
-            squared = (last[a] ** 2).sum(axis=1)
-            along = (motion[b] * last[a]).sum(axis=1)[squared > 0.0]
-            if len(along) >= _FLOW.min_corners:
-                advance = median(along / squared[squared > 0.0])
-        self._last_motion = ids, motion
-        self._flows.append(_Flow(index, flow_px, advance))
-
-    def _flow_px(self) -> float | None:
-        """Flow of the features between the two frames before the present one (median)."""
-        if self._seen is None or self._seen_before is None:
+    def _advance(self, motion: _Motion) -> float | None:
+        """A motion of the features along their last one, over that one; None: the two share too
+        few.
+        """
+        last = self._last_motion
+        self._last_motion = motion
+        if last is None:
             return None
-        return _median_flow_px(self._seen_before, self._seen)
+        a, b = shared_rows(last.ids, motion.ids)
+        squared = (last.px[a] ** 2).sum(axis=1)
+        along = (motion.px[b] * last.px[a]).sum(axis=1)[squared > 0.0]
+        if len(along) < _FLOW.min_corners:
+            return None
+        return median(along / squared[squared > 0.0])
 
     @property
     def flow_px(self) -> float | None:
@@ -269,7 +272,7 @@ class FrozenImages:
         if self._crept < _FLOW.max_crept and self._creeps():
             self._crept += 1
             return Repeated(shown.index, True, certain=False)
-        self._still = self._still or (frame.index, self._flow_px() or 0.0)
+        self._still = self._still or (frame.index, self._flow_px or 0.0)
         return None
 
     def _judge_changed(
@@ -281,12 +284,12 @@ class FrozenImages:
         self._crept = 0
         if self._seen is None or expected is None:
             return None
-        since = self._paused_since()
-        is_expected = self._repeating is not None and self._repeating.certain
-        if is_expected or since is not None:
+        if self._repeating is not None and self._repeating.certain:
             frozen = _unmoved(shown, frame, self._seen)
-            if not is_expected:
-                frozen = frozen and not self._at_standstill()
+            return Repeated(shown.index, False) if frozen else None
+        since = self._paused_since()
+        if since is not None:
+            frozen = _unmoved(shown, frame, self._seen) and not self._at_standstill()
         else:
             frozen = self._has_stopped(frame, shown, self._seen, expected)
         return Repeated(shown.index, False, since=since) if frozen else None
@@ -324,7 +327,7 @@ class FrozenImages:
         """Whether the rig moves: by the last frames' features, the IMU's samples, else by the
         prediction.
         """
-        if (self._flow_px() or 0.0) > _FLOW.moved_px:
+        if (self._flow_px or 0.0) > _FLOW.moved_px:
             return True
         if self._imu:
             return not self._at_standstill()
@@ -334,11 +337,9 @@ class FrozenImages:
         """Whether the rig moves slowly, and would move on as its features' flow has changed; with
         an IMU, that decides.
         """
-        if self._imu or self._seen_first is None or self._seen_before is None:
-            return False
-        now_px = self._flow_px()
-        before_px = _median_flow_px(self._seen_first, self._seen_before)
-        if now_px is None or before_px is None:
+        now_px = self._flow_px
+        before_px = self._flow_before_px
+        if self._imu or now_px is None or before_px is None:
             return False
         return min(now_px, 2.0 * now_px - before_px) > _FLOW.crept_px
 
@@ -371,18 +372,10 @@ def _equal(a: Image, b: Image) -> bool:
     return np.array_equal(a[: _FLOW.first_rows], b[: _FLOW.first_rows]) and np.array_equal(a, b)
 
 
-def _moved(before: Observations, now: Observations | TrackPrior) -> tuple[IntArray, FloatArray]:
-    """Features that two sets share: their rows (K,) in the first, and by how many pixels (K,) they
-    differ in the left image.
-    """
+def _motion(before: Observations, now: Observations | TrackPrior) -> _Motion:
+    """How the features that two sets share have moved in the left image."""
     a, b = shared_rows(before.ids, now.ids)
-    return a, lengths(now.z[b, :2] - before.z[a, :2])
-
-
-def _median_flow_px(before: Observations, now: Observations) -> float | None:
-    """Median flow of the features of two frames in the left image; None: they share too few."""
-    _, moved_px = _moved(before, now)
-    return median(moved_px) if len(moved_px) >= _FLOW.min_corners else None
+    return _Motion(now.ids[b], now.z[b, :2] - before.z[a, :2], a)
 
 
 def _pauses(flow: _Flow) -> bool:
@@ -414,8 +407,8 @@ def _same_depths(a: FloatArray, b: FloatArray) -> bool:
 
 def _predicted_to_move(seen: Observations, expected: Prediction, least_px: float) -> Observations:
     """The features of the last frame that the prediction moves clearly in the left image."""
-    rows, moved_px = _moved(seen, expected.tracks)
-    return seen.take(rows[moved_px > least_px])
+    motion = _motion(seen, expected.tracks)
+    return seen.take(motion.rows[lengths(motion.px) > least_px])
 
 
 def _images(frame: StereoFrame) -> list[Image]:
