@@ -24,6 +24,7 @@ from vio.frontend.weighted_fit import ROW_SIGMA_PX, add_equations
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays
 from vio.numerics.compiled import solve_positive
+from vio.numerics.robust import robust_sigma
 from vio.records import Image
 
 
@@ -124,7 +125,11 @@ class RightDelay(Finder):
         terms = np.array([np.ones(len(x)), x, y, x * y, x * x, y * y, flow[:, 1]]).T.copy()
         self._normal = _DELAY.memory * self._normal
         self._moment = _DELAY.memory * self._moment
-        sigma = ROW_SIGMA_PX if self._frames else np.inf
+        # rows noisier than that, few of which would weigh, are alike in what a left pixel's error
+        # adds to its row and to its flow, as a delay does
+        sigma = np.inf
+        if self._frames:
+            sigma = max(ROW_SIGMA_PX, robust_sigma(rows - terms @ self._solution))
         count, square = add_equations(
             terms, rows, self._solution, sigma, self._normal, self._moment
         )

@@ -138,6 +138,12 @@ def test_features_that_scatter_are_no_object() -> None:
     assert codes(objects.take_findings()) == []
 
 
+@pytest.mark.parametrize("noise_px", [1.0, 3.0])
+def test_noise_of_the_rows_is_no_delay(noise_px: float) -> None:
+    """An error of a left pixel is in its row and in its flow, as a delay of the right camera is."""
+    assert codes(inspected(flight(noise_px=noise_px, nod=0.1))[1]) == []
+
+
 def test_exchanged_pixels_are_put_back_to_the_bit() -> None:
     seen = flight(visible=0.8)
     out, _ = inspected(changed(COLUMNS["exchanged"], seen))
