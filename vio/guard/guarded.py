@@ -17,6 +17,7 @@ from vio.guard.object_matches import ObjectMatches
 from vio.guard.pairing import PairingCheck
 from vio.guard.probe import RowProbe
 from vio.guard.projected_dots import ProjectedDots
+from vio.guard.repeated_features import RepeatedFeatures
 from vio.guard.swap import SwapDetector
 from vio.guard.torn import TornImages
 from vio.guard.turned_pair import TurnedPair
@@ -72,6 +73,7 @@ class GuardedFrontend:
         self._may_check = frontend if isinstance(frontend, ChecksMatches) else None
         self._may_check_objects = frontend if isinstance(frontend, ChecksObjects) else None
         self._checks = image_checks(camera)
+        self._repeats = RepeatedFeatures()
         self._matches = RightMatches(camera)
         self._objects = ObjectMatches(camera)
         self._never = NeverMatched() if self._pair else None
@@ -123,9 +125,13 @@ class GuardedFrontend:
         Without a usable right image there is nothing of it to check.
         """
         seen = output.observations
+        is_checked = self._may_check is not None and self._may_check.checks_matches
+        if not is_checked:
+            seen = self._repeats.inspect(seen)
+            found = (*found, *self._repeats.take_findings())
         if not right_usable:
             seen = without_right(seen)
-        elif self._may_check is None or not self._may_check.checks_matches:
+        elif not is_checked:
             seen = self._matches.inspect(seen)
             found = (*found, *self._matches.take_findings())
         if self._may_check_objects is None or not self._may_check_objects.checks_objects:
