@@ -107,6 +107,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "shares": (_pixels(lambda z: z / [1200, 370, 1200, 370]), "shares of the image"),
     "from the centre": (_pixels(lambda z: z - CENTRE), "add cu and cv"),
     "twice the size": (_pixels(lambda z: 2 * z), "outside of the image of 1200 x 370"),
+    "half the size": (_pixels(lambda z: z / 2), "of images of half the size; halve fu fv cu cv"),
     "rows as ids": (_by_rows, "ids are not those of points"),
     "matches of two frames": (_between_two, "ids are not those of points"),
     "new ids": (_always_new, "features 0 have an id that the next frame has"),
@@ -189,7 +190,6 @@ def test_says_nothing_of_healthy_features(name: str, motion: str, tmp_path: Path
 def test_the_pixels_of_images_of_another_size_are_doubted(tmp_path: Path) -> None:
     arrays = _features()
     cases = {
-        "upper left quarter": {**arrays, "z": arrays["z"] / 2},
         r"and the principal point is \(610, 180\)": {
             **_without("image_size")(arrays),
             "z": 2 * arrays["z"],
@@ -199,6 +199,18 @@ def test_the_pixels_of_images_of_another_size_are_doubted(tmp_path: Path) -> Non
         recording = open_dataset(make_npz(tmp_path / "features.npz", changed)).recording
         assert len(recording.doubts) == 1
         assert re.search(words, recording.doubts[0])
+
+
+def test_the_left_pixel_itself_is_no_right_one(tmp_path: Path) -> None:
+    arrays = _features()
+    lost = ~arrays["has_right"]
+    arrays["z"][lost, 2:] = arrays["z"][lost, :2]
+    arrays["has_right"] = np.ones(len(lost), dtype=np.bool_)
+    dataset = open_dataset(make_npz(tmp_path / "features.npz", arrays))
+    first = dataset.observations(0)
+    assert first is not None
+    assert first.has_right.tolist() == (~lost[: len(first)]).tolist()
+    assert f"ur vr are ul vl in {lost.sum()} rows" in dataset.recording.notes[0]
 
 
 @pytest.mark.parametrize("pixel", [-1.0, 0.0, np.nan])

@@ -53,8 +53,8 @@ def without_placeholders(tracks: FeatureTracks) -> tuple[FeatureTracks, str | No
     """Return tracks whose right pixels that stand for "not found" have no `has_right`, and what was
     taken so.
 
-    These are pixels that are no numbers, and pairs at or below zero that several rows share to the
-    last bit, as -1 -1.
+    These are pixels that are no numbers, pairs at or below zero that several rows share to the
+    last bit, as -1 -1, and the left pixel itself, to the last bit, in several rows.
     """
     right = tracks.z[:, 2:]
     empty = np.isnan(right).any(axis=1)
@@ -62,10 +62,13 @@ def without_placeholders(tracks: FeatureTracks) -> tuple[FeatureTracks, str | No
     values, place, counts = np.unique(right[low], axis=0, return_inverse=True, return_counts=True)
     shared = np.zeros(len(right), dtype=np.bool_)
     shared[low] = (counts > 1)[place.reshape(-1)]
-    held = tracks.has_right & (empty | shared)
+    own = tracks.has_right & (right == tracks.z[:, :2]).all(axis=1)
+    own &= own.sum() > 1
+    held = tracks.has_right & (empty | shared | own)
     if not held.any():
         return tracks, None
     kinds = ["no numbers"] if (tracks.has_right & empty).any() else []
+    kinds += ["ul vl"] if own.any() else []
     kinds += [f"{u:g} {v:g}" for u, v in values[counts > 1].tolist()]
     note = (
         f"ur vr are {' or '.join(kinds[:3])} in {int(held.sum())} rows that has_right marks as "
@@ -101,14 +104,12 @@ def features_fault(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
 
 
 def features_doubt(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
-    """Return a note where pixels and principal point look like those of images of two sizes: all
-    features fill the upper left quarter alone, or go far beyond an image of no stated size.
+    """Return a note where pixels and principal point look like those of images of two sizes:
+    features go far beyond an image of no stated size.
     """
     if len(tracks.ids) < _RULES.fewest or camera.projection != "pinhole":
         return None
-    half = np.array([camera.cu, camera.cv])
-    if camera.width is not None and camera.height is not None:
-        half = 0.5 * np.array([camera.width, camera.height])
+    half = _half_size(camera)
     farthest = tracks.z[:, :2].max(axis=0)
     reached = f"({farthest[0]:.0f}, {farthest[1]:.0f})"
     if (farthest > _RULES.beyond * half).all():
@@ -116,13 +117,14 @@ def features_doubt(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
             f"{DOUBT}features lie up to {reached}, and the principal point is ({half[0]:.0f}, "
             f"{half[1]:.0f}); intrinsics and pixels must be of images of one size"
         )
-    is_quarter = (farthest <= (1 + _RULES.unlike) * half) & (farthest >= _RULES.filled * half)
-    if not is_quarter.all():
-        return None
-    return (
-        f"{DOUBT}all features lie in the upper left quarter of the image, up to {reached}; if they "
-        "are pixels of images of half the size, halve fu fv cu cv, too"
-    )
+    return None
+
+
+def _half_size(camera: StereoCamera) -> FloatArray:
+    """Half the size (2,) of an image, which is the principal point where none is stated, px."""
+    if camera.width is None or camera.height is None:
+        return np.array([camera.cu, camera.cv])
+    return 0.5 * np.array([camera.width, camera.height])
 
 
 def _of_intrinsics(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
@@ -238,7 +240,7 @@ def _of_places(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
     """Whether the left pixels lie in the image."""
     left = tracks.z[:, :2]
     if _outside(left, camera) <= _RULES.few:
-        return None
+        return _of_quarter(left, camera)
     centre = np.array([camera.cu, camera.cv])
     if (left < -_RULES.near_px).any() and _outside(left + centre, camera) <= _RULES.few:
         return (
@@ -253,6 +255,21 @@ def _of_places(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
         f"(u {low[0]:.0f} to {high[0]:.0f}, v {low[1]:.0f} to {high[1]:.0f}): they are those of images "
         "of another size, or u and v are exchanged; intrinsics, image_size and pixels must be of one "
         "image"
+    )
+
+
+def _of_quarter(left: FloatArray, camera: StereoCamera) -> str | None:
+    """Whether left pixels (N, 2) fill the upper left quarter of the image, and no more."""
+    half = _half_size(camera)
+    farthest = left.max(axis=0)
+    fills = (farthest <= (1 + _RULES.unlike) * half) & (farthest >= _RULES.filled * half)
+    if camera.projection != "pinhole" or not fills.all():
+        return None
+    return (
+        "all features lie in the upper left quarter of the image, up to "
+        f"({farthest[0]:.0f}, {farthest[1]:.0f}): they are pixels of images of half the size; halve "
+        "fu fv cu cv, too, or double the pixels; if no others were looked for, state the size of "
+        "that quarter as image_size"
     )
 
 
