@@ -144,6 +144,24 @@ def test_noise_of_the_rows_is_no_delay(noise_px: float) -> None:
     assert codes(inspected(flight(noise_px=noise_px, nod=0.1))[1]) == []
 
 
+@pytest.mark.parametrize("columns", [[0, 1, 2, 3], [3]], ids=["features", "right rows"])
+def test_single_wrong_features_are_left_out(columns: list[int]) -> None:
+    rng = np.random.default_rng(8)
+    seen = flight()
+    wrong = [rng.random(len(o)) < 0.3 for o in seen]
+    off = rng.choice([-1.0, 1.0], (900, 4)) * rng.uniform(15.0, 30.0, (900, 4))
+    for o, mask in zip(seen, wrong, strict=True):
+        o.z[np.ix_(mask, columns)] += off[o.ids[mask]][:, columns]
+    out, findings = inspected(seen)
+    assert codes(findings) == []
+    for o, before, now, mask in zip(out[6:], seen[5:], seen[6:], wrong[6:], strict=False):
+        left = o.ids if columns != [3] else o.ids[o.has_right]
+        # where a feature should be is told by the frame before, where it is right there
+        told = np.isin(now.ids, before.ids[~wrong[before.frame_index]])
+        assert np.isin(now.ids[mask & told], left).mean() < 0.05
+        assert np.isin(now.ids[~mask & told], left).mean() > 0.97
+
+
 def test_exchanged_pixels_are_put_back_to_the_bit() -> None:
     seen = flight(visible=0.8)
     out, _ = inspected(changed(COLUMNS["exchanged"], seen))

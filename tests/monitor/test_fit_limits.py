@@ -495,7 +495,7 @@ def _has_begun(px: float) -> bool:
     ids = list(range(20))
     images.observations(observations(0, 0, ids, np.ones((20, 4))))
     images._ended_still = 3, 0.5
-    images.observations(observations(1, 1, ids, np.ones((20, 4)) + [px, 0.0, px, 0.0]))
+    images.observations(observations(1, 1, ids, np.ones((20, 4)) + np.array([px, 0.0, px, 0.0])))
     return images.take_held() is not None
 
 

@@ -17,6 +17,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.match_check import Hysteresis, MatchCheck, SharedMatches, without_right
 from vio.numerics.compiled import solve_positive
+from vio.numerics.robust import median
 from vio.records import Observations
 
 
@@ -33,6 +34,9 @@ class _RowRules:
     clear_ratio: float = 5.0  # … and times the usual one
     agreeing_ratio: float = 0.5  # of the distance that contradicts, below which the rows fit again
     usual_gain: float = 0.2  # how fast the usual distance is learned
+    # a single row that is off by so much, and by so many times the usual distance, is no match
+    min_wrong_px: float = 3.0
+    wrong_ratio: float = 10.0
 
 
 _ROWS = _RowRules()
@@ -63,7 +67,8 @@ class DisplacedMatches(MatchCheck):
             return seen if state.since is None else without_right(seen)
         terms = self._terms(z)
         rows = z[:, 3] - z[:, 1]
-        off_px = float(np.median(np.abs(rows - terms @ self._field)))
+        distance_px = np.abs(rows - terms @ self._field)
+        off_px = median(distance_px)
         limit_px = max(_ROWS.min_rows_px, _ROWS.clear_ratio * self._usual_px)
         sign = self._sign(off_px, limit_px)
         state.show(index, sign)
@@ -82,7 +87,24 @@ class DisplacedMatches(MatchCheck):
         if state.ends():
             message = f"frame {index}: the right pixels agree with the left ones again"
             self._found.append(Finding(_CODE, message, index, ended=True))
-        return seen if state.since is None else without_right(seen)
+        if state.since is not None:
+            return without_right(seen)
+        return self._without_wrong(seen, distance_px)
+
+    def _without_wrong(self, seen: Observations, distance_px: FloatArray) -> Observations:
+        """Return features without right pixels that are far off the field by themselves.
+
+        Args:
+            seen: of a frame.
+            distance_px: (N,) of the rows of those with a right pixel from the field.
+        """
+        limit_px = max(_ROWS.min_wrong_px, _ROWS.wrong_ratio * self._usual_px)
+        wrong = distance_px > limit_px
+        if self._frames < _ROWS.min_frames or not wrong.any():
+            return seen
+        dropped = np.zeros(len(seen), dtype=np.bool_)
+        dropped[seen.has_right] = wrong
+        return without_right(seen, dropped)
 
     def _sign(self, off_px: float, limit_px: float) -> bool | None:
         if self._frames < _ROWS.min_frames:

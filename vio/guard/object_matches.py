@@ -40,6 +40,7 @@ class _ObjectRules:
     usual_gain: float = 0.1  # how fast that is learned
     max_usual_px: float = 5.0  # beyond which it is not believed
     min_frames: int = 5  # that it was learned from
+    wrong_ratio: float = 4.0  # of the limit: a feature beyond is none of that point
     seed: int = 0  # of the consensus
 
 
@@ -150,7 +151,8 @@ class ObjectMatches(Finder):
         elif chosen.object_share > 0.0:
             dropped[shared.rows] = ~self._static(problem, shared, chosen.motion)
         else:
-            self._learn(points, found)
+            errors_px = self._learn(points, found)
+            dropped[shared.rows[deep]] = errors_px > _OBJECTS.wrong_ratio * limit_px
         return dropped
 
     def _consensus(
@@ -171,13 +173,14 @@ class ObjectMatches(Finder):
             problem, points.p_prev, points.pixels, expected, prior.R_cam_prev, T_prior
         )
 
-    def _learn(self, points: MovedPoints, found: Consensus) -> None:
-        """Learn how far features usually are from one motion."""
+    def _learn(self, points: MovedPoints, found: Consensus) -> FloatArray:
+        """Learn how far features usually are from one motion; return how far (N,) these are, px."""
         errors = pixel_errors(self._camera, found.T_curr_prev, points.p_prev, points.pixels)
         median_px = min(float(np.median(errors)), _OBJECTS.max_usual_px)
         self._frames += 1
         gain = max(_OBJECTS.usual_gain, 1.0 / self._frames)
         self._usual_px += gain * (median_px - self._usual_px)
+        return errors
 
     def _static(self, problem: RansacProblem, shared: _Shared, motion: Consensus) -> BoolArray:
         """Which features (K,) follow the camera's motion, by their depths or at any depth."""
