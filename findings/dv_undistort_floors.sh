@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# dv-processing 2.0.4: `CameraGeometry.undistort` and `backProjectUndistort` take points of float32, and use the pixel whose upper left corner they are: (100.9, 100.9) comes back as (100, 100), to the
-# last bit. Points of features come back 0.6 px left of and above their place on average, and up to 2.5 px off where the lens stretches most.
+# dv-processing 2.0.4: `CameraGeometry.undistort` and `backProjectUndistort` take points of float32, and drop what is behind the decimal point: (100.9, 100.9) comes back as (100, 100) does, to
+# the last bit. Points of features come back 0.6 px left of and above their place on average, and up to 2.5 px off where the lens stretches most.
 # `backProject` is exact with `subPixel=True`, which these two lack; `project` and `distort` are exact as well.
 # Guessed: what takes fractions of a pixel uses them; or, by the text of `backProject` ("rounding the coordinates to first integer"), rounds to the nearest pixel, without a bias.
-# Matters here: it is the library of the DAVIS and DVXplorer, stereo rigs of events, images and an IMU, whose own trackers return features to hundredths of a pixel. Rays made with it are rounded
+# Matters here: it is the library of the DAVIS and DVXplorer, stereo rigs of events, images and an IMU. Rays of features made with it are rounded
 # to pixels and turned by half of one, 0.07 degrees at f = 450 px, as by a principal point that is off: in both cameras alike, so disparities do not show it.
 # Source: dv-processing's texts of these functions, which name a table for speed but no rounding for `undistort`; this run.
 set -euo pipefail
