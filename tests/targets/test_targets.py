@@ -180,6 +180,22 @@ def test_finds_corners_of_a_grid(exposure: Exposure, share: float, error_px: flo
     assert (np.abs(error.mean(axis=0)) < 4 * error.std(axis=0) / np.sqrt(len(error))).all()
 
 
+def test_a_far_tag_is_found_in_its_size() -> None:
+    """The detector of OpenCV that these corners begin with finds tags 2 % too small."""
+    scales = []
+    for turn in (0.1, 0.4, 0.7):
+        T = se3_from_parts(so3_exp([0.05, -0.1, turn]), [-0.3, -0.25, 0.8])
+        found, uv, _ = _detected(GRID, SMALL_LEFT, T, Exposure(0.7, 3.0))
+        for tag in np.unique(found.ids // 4):
+            own = found.ids // 4 == tag
+            if own.sum() < 4:
+                continue
+            true = uv[found.ids[own]] - uv[found.ids[own]].mean(axis=0)
+            scales.append((found.uv[own] * true).sum() / (true * true).sum())
+    assert len(scales) > 80
+    assert np.mean(scales) == pytest.approx(1, abs=1e-3)
+
+
 @pytest.mark.parametrize("blur_px", [2.0, 4.0])
 def test_finds_corners_of_a_blurred_grid(blur_px: float) -> None:
     T = se3_from_parts(so3_exp([0.3, -0.2, 0.1]), [-0.2, -0.17, 0.32])
