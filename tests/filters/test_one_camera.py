@@ -33,7 +33,7 @@ from vio.frontend import FrontendSettings, build_frontend
 from vio.frontend.one_camera import disparities
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp, transform_points
-from vio.geometry.stereo import left_alone, left_rays, one_camera
+from vio.geometry.stereo import StereoCamera, left_alone, left_rays, one_camera
 from vio.live.build import build_backend
 from vio.records import ImuSample, Observations, StereoFrame
 
@@ -523,7 +523,14 @@ def test_left_camera_of_a_pair_has_no_right_side(tmp_path: Path) -> None:
     assert all(e.right is None for e in dataset.events() if isinstance(e, StereoFrame))
 
 
-@pytest.mark.parametrize("command", [["calibrate"], ["convert", "--to", "euroc", "--out", "x"]])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["calibrate"],
+        ["convert", "--to", "euroc", "--out", "x"],
+        ["run", "--save-calibration", "--out", "x"],
+    ],
+)
 def test_commands_for_pairs_say_so_in_one_line(
     tmp_path: Path,
     command: list[str],
@@ -538,6 +545,15 @@ def test_commands_for_pairs_say_so_in_one_line(
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
     assert len(lines) == 1
     assert "needs a stereo pair" in lines[0]
+
+
+def test_the_calibration_of_one_camera_needs_its_rig() -> None:
+    camera = StereoCamera(300.0, 300.0, 79.5, 59.5, 0.1, 160, 120, kind="rgbd")
+    with vio.Odometry(camera, vio.load_config(overrides=["motion=none"])) as odometry:
+        image = np.random.default_rng(0).integers(0, 255, (120, 160), dtype=np.uint8)
+        odometry.add_images(0, image, None, depth_m=np.full((120, 160), 2.0, np.float32))
+        with pytest.raises(DataError, match="give Odometry its rig"):
+            odometry.calibrated_rig()
 
 
 def test_a_start_that_fails_is_explained_once(

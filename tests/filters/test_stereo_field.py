@@ -38,7 +38,7 @@ from vio.datasets.observation_log import write_observation_log
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import StereoRig, project_point
-from vio.geometry.lie import FloatArray, se3_inverse, so3_log
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_log
 from vio.geometry.rectify import rectified_cameras, rectify_pixels
 from vio.geometry.stereo import StereoCamera
 from vio.offline.saved_run import read_saved_run
@@ -131,6 +131,19 @@ def test_baseline_and_focal_length_found_go_into_the_rig(given: Rig) -> None:
             atol=1e-9,
         )
     assert found.lines() == ("baseline off by +3.00 ± 0.20 %", "focal length off by -5.00 ± 0.10 %")
+
+
+@pytest.mark.parametrize("levels", [1000.0, None], ids=["depths", "one camera"])
+def test_what_was_found_of_one_camera_goes_into_its_rig(levels: float | None) -> None:
+    """Extrinsics are those of the images as they are; depths are longer by both factors."""
+    given = Rig(RADTAN_RIG.cam0, T_cam0_imu=np.eye(4), depth_factor=levels)
+    T_cam0_imu = se3_exp(np.array([0.01, 0.02, -0.03, 0.01, -0.02, 0.005]))
+    scale = StereoScaleEstimate(np.log([1.03, 0.95]), np.diag([4e-6, 1e-6]))
+    estimate = Estimate(0, np.eye(4), np.eye(6), T_cam0_imu=T_cam0_imu, stereo_scale=scale)
+    found = calibrated_rig(given, estimate).rig
+    np.testing.assert_allclose(found.T_cam0_imu, T_cam0_imu)
+    assert found.cam0.fu == pytest.approx(0.95 * given.cam0.fu)
+    assert found.depth_factor == (levels and pytest.approx(levels / 1.03 / 0.95))
 
 
 def test_without_an_estimate_the_rig_stays_as_given() -> None:

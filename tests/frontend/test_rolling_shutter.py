@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import vio
-from vio.cameras.rig import rectifier_of
+from vio.cameras.rig import Rig, rectifier_of
 from vio.errors import ConfigError
 from vio.findings import Finding
 from vio.frontend.readout_time import RowShares
 from vio.frontend.rolling_shutter import RollingShutter
-from vio.geometry.distortion import project_point
+from vio.geometry.distortion import CameraModel, project_point
 from vio.geometry.lie import FloatArray, se3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import Image, Observations, StereoFrame, observations
@@ -179,6 +179,21 @@ def test_rows_of_the_raw_image_count() -> None:
         assert np.abs(raw[:, 1] - v).max() > 5.0
         expected = (raw[:, 1] - 0.5 * (lens.height - 1)) * _READOUT_S / lens.height
         np.testing.assert_allclose(late_s[:, number], expected, atol=1.1 * _READOUT_S / lens.height)
+
+
+@pytest.mark.parametrize("depth_noise", [None, 0.0015])
+def test_rows_of_the_raw_image_of_one_camera_count(depth_noise: float | None) -> None:
+    """Where a lens is undistorted, of an image alone or with its depths."""
+    lens = CameraModel(280.0, 280.0, 240.0, 155.0, 480, 306, "radtan", (-0.3, 0.1, 0.0, 0.0))
+    rectifier = Rig(lens, depth_factor=1000.0).rectifier(depth_noise=depth_noise)
+    pixels = np.array([[40.0, 20.0, 30.0, 20.0], [400.0, 290.0, 390.0, 290.0]])
+    shares = RowShares(rectifier.camera, rectifier).of(pixels)
+    for number in range(2):
+        uv = pixels[:, 2 * number : 2 * number + 2]
+        raw, _ = project_point(lens, left_rays(rectifier.camera, uv))
+        assert np.abs(raw[:, 1] - uv[:, 1]).max() > 5.0
+        expected = (raw[:, 1] - 0.5 * (lens.height - 1)) / lens.height
+        np.testing.assert_allclose(shares[:, number], expected, atol=0.6 / lens.height)
 
 
 def test_features_without_an_image_size_are_refused() -> None:

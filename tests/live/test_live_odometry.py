@@ -391,6 +391,21 @@ def test_a_slow_computer_is_named_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "10 of the last 12 frames left out" in line
 
 
+def test_results_after_a_reset_are_counted_where_times_begin_anew() -> None:
+    """A frame that waited for samples has no result, and the publisher starts again at 0."""
+    monitor = LiveMonitor(judges_latency=True)
+    monitor.arrived(10**12)
+    for k in range(3):
+        monitor.arrived(k)
+        monitor.result(k)
+    assert monitor.results == 3
+    monitor.arrived(4)  # left out
+    monitor.arrived(5)
+    monitor.result(5)
+    assert monitor.figures(0).results == 4
+    assert not monitor._arrived
+
+
 @pytest.fixture
 def usual_gc() -> Iterator[None]:
     """The collector as Python has it, whatever commands in this process have set."""

@@ -14,6 +14,7 @@ from tests.mapping.test_map_store import CAMERA, _features, _pose, _row, fill
 from vio.cli import main
 from vio.errors import DataError
 from vio.geometry.lie import se3_exp
+from vio.geometry.relative_pose import RelativePose
 from vio.mapping.files import check_map, describe_map, drop_session, extract_map, prune_map
 from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, PlacesRow, SessionRow
@@ -226,6 +227,26 @@ def test_sessions_that_a_dropped_one_had_joined_stay_where_they_are(tmp_path: Pa
         before = graph.T_map_cam.rows[4].copy()
         graph.optimise_part(0)
         np.testing.assert_allclose(graph.T_map_cam.rows[4, :3, 3], before[:3, 3], atol=1e-9)
+
+
+def test_a_frame_that_is_not_level_stays_so_without_its_first_session(tmp_path: Path) -> None:
+    """A session with an IMU, joined to one of images alone, which a tilted camera has begun."""
+    path = tmp_path / "a.map"
+    T_map_odom = se3_exp([0.0, 0.0, 0.0, 0.5, 0.0, 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    with closing(MapStore(path, create=True)) as store:
+        for n in range(2):
+            store.add_session(SessionRow(f"s{n}", CAMERA, n == 1, 0))
+        store.add_keyframe(_row(0), _features(0))
+        for k in (1, 2):
+            row = replace(_row(k), session=1, T_map_cam=T_map_odom, T_odom_cam=np.eye(4), up_cam=up)
+            store.add_keyframe(row, _features(k))
+        store.add_odometry(1, 2, RelativePose(np.eye(4), np.eye(6)))
+    drop_session(path, 0)
+    with closing(MapStore(path, read_only=True)) as left:
+        graph = MapGraph(left)
+        graph.optimise_part(0)
+        np.testing.assert_allclose(graph.T_map_cam.rows, [T_map_odom, T_map_odom], atol=1e-9)
 
 
 def test_a_map_behind_a_link_is_changed_where_it_is(tmp_path: Path) -> None:

@@ -553,6 +553,43 @@ def test_an_odometry_of_few_features_has_keyframes_too(tmp_path: Path) -> None:
     store.close()
 
 
+def test_a_map_begins_where_the_images_show_something(tmp_path: Path) -> None:
+    """A lens cap that stays on for half a second."""
+    session = MapSession(
+        tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False
+    )
+    for k in range(12):
+        count = 40 if k >= 5 else 0
+        ids = np.arange(count) + 30 * k
+        _stand(session, observations(k, 10**8 * k, ids, np.tile([9.0, 9, 5, 9], (count, 1))))
+    session.finish()
+    session.close()
+    with closing(MapStore(tmp_path / "a.map", read_only=True)) as store:
+        assert [row.frame for row in store.keyframes()] == list(range(5, 12))
+
+
+def test_a_session_without_a_keyframe_leaves_the_map_to_the_next_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.map"
+    for frames in (0, 1):
+        session = MapSession(path, CAMERA, np.eye(4), source="dark", imu=False, localise=False)
+        for k in range(frames):
+            _stand(session, observations(k, k, np.zeros(0, dtype=np.int64), np.zeros((0, 4))))
+        session.finish()
+        assert len(session.map_keyframes().frame) == 0
+        np.testing.assert_array_equal(session.T_map_odom, np.eye(4))
+        session.close()
+    session = MapSession(path, CAMERA, np.eye(4), source="light", imu=False, localise=False)
+    for k in range(12):
+        seen = observations(k, k, np.arange(40) + 30 * k, np.tile([9.0, 9, 5, 9], (40, 1)))
+        _stand(session, seen)
+    session.finish()
+    assert session.is_joined
+    np.testing.assert_allclose(session.T_map_odom, np.eye(4), atol=1e-9)
+    session.close()
+    with closing(MapStore(path, read_only=True)) as store:
+        assert [row.source for row in store.sessions()] == ["light"]
+
+
 def test_motions_have_errors_that_tracks_do_not_average_out(tmp_path: Path) -> None:
     """A filter that is sure to a micrometre of a metre: the calibration is not."""
     steps = [np.eye(4), se3_exp([0.0, 0, 1.0, 0, 0.5, 0])]

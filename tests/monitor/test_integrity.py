@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -285,3 +286,21 @@ def test_a_mark_of_the_scale_changes_the_covariance_alone() -> None:
     np.testing.assert_allclose(
         np.diag(changed.covariance - given.covariance), [0.01, 0.01, 0.01, 0, 0, 0]
     )
+
+
+def test_an_hour_of_frames_takes_little_memory() -> None:
+    """A live run has no end; what began with an early frame is still known."""
+    count = 20_000
+    monitor = IntegrityMonitor()
+    tracemalloc.start()
+    for k in range(count):
+        monitor.judged(k, estimate(k))
+    grown, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert grown < 40 * count
+    finding = Finding("images-held", "", count, 10)
+    assert finding.effect == "unusable"
+    monitor.take(finding)
+    held = monitor.judged(count, estimate(count))
+    moved_m = 2.0 * (count - 10) * STEP_NS * 1e-9
+    assert np.sqrt(held.covariance[0, 0]) == pytest.approx(moved_m, rel=1e-3)

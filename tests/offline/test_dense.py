@@ -356,6 +356,16 @@ def test_an_obstacle_stands_above_a_step_and_below_a_door(height_m: float, level
     assert _plan_at(np.concatenate([_floor(np.arange(0, 2, 0.1), 0.0), things]), 1.01) == level
 
 
+def test_a_floor_is_free_up_to_its_rim() -> None:
+    at = np.arange(0.025, 2, 0.05)
+    x, y = (g.ravel() for g in np.meshgrid(at, at))
+    vertices = np.stack([x, y, np.zeros_like(x)], axis=1).astype(np.float32)
+    mesh = Mesh(vertices, vertices, np.zeros_like(vertices, np.uint8), np.zeros((0, 3), np.uint32))
+    plan = occupancy_grid(mesh, np.eye(3), 0.05)
+    assert plan is not None
+    assert (plan.levels == FREE).all()
+
+
 @pytest.mark.parametrize(("points", "level"), [(1, FREE), (2, OCCUPIED)])
 def test_one_vertex_is_no_obstacle(points: int, level: int) -> None:
     things = np.tile([1.01, 1.01, 1.0], (points, 1))

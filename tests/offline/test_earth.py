@@ -560,6 +560,14 @@ def test_tables_state_what_is_known(tmp_path: Path) -> None:
     assert len(read_gnss(file, None).times_ns) == 2
 
 
+def test_a_fix_beside_a_row_without_one_of_the_same_time_is_kept() -> None:
+    times_ns = np.array([1, 1, 2, 2, 2])
+    geodetic = np.array([[0, 0, 0], [48, 11, 5], [48.1, 11, 5], [0, 0, 0], [48.2, 11, 5]])
+    fixes = checked_fixes(times_ns, geodetic, None, "x")
+    assert fixes.times_ns.tolist() == [1, 2]
+    assert fixes.geodetic[:, 0].tolist() == [48, 48.1]
+
+
 def test_a_path_across_the_equator_is_in_one_zone(tmp_path: Path) -> None:
     write_utm(tmp_path / "x.csv", np.array([[1e-4, 11.0, 0.0], [-1e-4, 11.0, 0.0]]))
     northings = np.loadtxt(tmp_path / "x.csv", delimiter=",", skiprows=2)[:, 1]

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -598,6 +599,20 @@ def test_association_by_time(
     assert list(zip(rows.tolist(), reference_rows.tolist(), strict=True)) == expected
 
 
+def test_the_time_of_an_association_grows_with_the_poses() -> None:
+    """Eight times as many take about eight times as long."""
+    rng = np.random.default_rng(0)
+    seconds = []
+    for count in (10_000, 80_000):
+        a = 5_000_000 * np.arange(count)
+        b = a + rng.integers(-2_000_000, 2_000_000, count)
+        began = time.process_time()
+        rows, _ = associate_times(a, b, max_difference_ns=10_000_000)
+        seconds.append(time.process_time() - began)
+        assert len(rows) > 0.99 * count
+    assert seconds[1] < 16 * seconds[0]
+
+
 times = st.lists(st.integers(0, 200), max_size=25, unique=True).map(sorted)
 
 
@@ -612,9 +627,9 @@ def test_association_is_one_to_one_in_order_and_leaves_no_close_pair(
     distances = {i: abs(a[i] - b[j]) for i, j in zip(rows, reference_rows, strict=True)}
     assert all(d <= limit for d in distances.values())
     partner = dict(zip(reference_rows, rows, strict=True))
-    for i, time in enumerate(a):
+    for i, time_ns in enumerate(a):
         for j, other in enumerate(b):
-            d = abs(time - other)
+            d = abs(time_ns - other)
             if d < min(
                 limit + 1, distances.get(i, limit + 1), distances.get(partner.get(j, -1), limit + 1)
             ):

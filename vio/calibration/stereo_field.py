@@ -272,7 +272,8 @@ def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
         out = CalibratedRig(given, np.zeros(len(PARAMETERS)), np.diag(_PRIOR**2), 0.0)
     rig = out.rig
     if estimate.T_cam0_imu is not None:
-        R_cam0_rect = _Frame.of(given).R_rect_cam0.T
+        # images of one camera are not turned
+        R_cam0_rect = np.eye(3) if given.cam1 is None else _Frame.of(given).R_rect_cam0.T
         rig = replace(
             rig, T_cam0_imu=se3_from_parts(R_cam0_rect, np.zeros(3)) @ estimate.T_cam0_imu
         )
@@ -285,12 +286,18 @@ def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
 
 def _scaled(rig: Rig, baseline: float, focal: float) -> Rig:
     """Return a rig whose baseline and focal lengths are longer by factors exp(baseline) and
-    exp(focal), (R4).
+    exp(focal), (R4); for one camera, depths are longer by both.
     """
+    cam0 = _longer(rig.cam0, focal)
+    if rig.cam1 is None:
+        levels = rig.depth_factor
+        if levels is not None:
+            levels *= math.exp(-baseline - focal)
+        return replace(rig, cam0=cam0, depth_factor=levels)
     cam1, T_cam1_cam0 = rig.right
     T = T_cam1_cam0.copy()
     T[:3, 3] *= math.exp(baseline)
-    return replace(rig, cam0=_longer(rig.cam0, focal), cam1=_longer(cam1, focal), T_cam1_cam0=T)
+    return replace(rig, cam0=cam0, cam1=_longer(cam1, focal), T_cam1_cam0=T)
 
 
 def _longer(camera: CameraModel, focal: float) -> CameraModel:

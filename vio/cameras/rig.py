@@ -124,7 +124,10 @@ class Rectifier:
         """
         if self.maps is None:
             return None
-        rows: IntArray = self.maps[camera][0][..., 1]
+        first, second = self.maps[camera]
+        if first.ndim == second.ndim:  # u and v, of one camera
+            return np.asarray(np.rint(second), dtype=np.int64)
+        rows: IntArray = first[..., 1]
         return rows
 
     def frame(

@@ -38,7 +38,7 @@ from vio.files.trajectories import read_trajectory
 from vio.live.build import CONFIGURED, MapUse, Parts, resolve_motion
 from vio.live.first_use import Part, compiled_beside
 from vio.protocols import Dataset, Viewer
-from vio.records import FrameResult, Recording, RunMotion, Trajectory
+from vio.records import FrameResult, Recording, RunMotion, Trajectory, need_stereo
 from vio.report.words import camera_imu_findings, scale_findings
 from vio.runs.files import CHECKPOINT, FILES, RunFile
 from vio.runs.folder import (
@@ -458,6 +458,7 @@ def _calibration_file(dataset: Dataset, folder: Path, asked: Path | None) -> Pat
     """
     if asked is None:
         return None
+    need_stereo(dataset.recording, "--save-calibration")
     if given_rig(dataset) is None:
         if dataset.recording.camera.is_cylinder:
             raise DataError(

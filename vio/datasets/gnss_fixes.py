@@ -61,13 +61,14 @@ def checked_fixes(
     # receivers write 0, 0 while they have no fix
     nowhere = (np.abs(geodetic[:, :2]) < _NO_DEGREES).all(axis=1)
     stated = np.isfinite(geodetic[:, :2]).all(axis=1) & ~nowhere
-    keep = stated & np.concatenate([[True], np.diff(times_ns) > 0])
-    if not keep.any():
+    rows = np.flatnonzero(stated)
+    keep = rows[np.unique(times_ns[rows], return_index=True)[1]]
+    if not len(keep):
         raise DataError(f"{where}: holds no position; give a record with a fix")
     notes += (
-        f"{int((~keep).sum())} of {len(keep)} rows without a position or of a repeated time are "
-        "skipped",
-    ) * bool((~keep).any())
+        f"{len(order) - len(keep)} of {len(order)} rows without a position or of a repeated time "
+        "are skipped",
+    ) * (len(keep) < len(order))
     times_ns = times_ns[keep]
     geodetic = geodetic[keep].copy()
     C = C[keep].copy()

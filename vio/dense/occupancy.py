@@ -73,6 +73,8 @@ def occupancy_grid(mesh: Mesh, R_upright_world: FloatArray, voxel_m: float) -> O
         height, width
     )
     occupied = standing.reshape(height, width) >= _GROUND.min_vertices
-    free = binary_closing(flat >= _GROUND.min_vertices, iterations=1) & ~occupied
+    # a cell beside the rim, so that closing does not take free cells at the rim away
+    closed = binary_closing(np.pad(flat >= _GROUND.min_vertices, 1))[1:-1, 1:-1]
+    free = closed & ~occupied
     levels = np.where(occupied, OCCUPIED, np.where(free, FREE, UNKNOWN)).astype(np.uint8)
     return OccupancyGrid(levels, cell_m, low * cell_m)

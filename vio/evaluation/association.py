@@ -4,7 +4,6 @@ interpolation.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
@@ -109,15 +108,21 @@ def associate_times(
     j = np.arange(len(i)) - begins + np.repeat(low, count)
     gap_ns = np.abs(a[i] - b[j])
     order = np.lexsort((j, i, gap_ns))
-    left: list[int] = []  # both stay ascending
-    right: list[int] = []
+    # pairs of rows further away cannot cross: each is within the largest difference
+    first = np.searchsorted(a, a - 2 * max_difference_ns, side="left").tolist()
+    end = np.searchsorted(a, a + 2 * max_difference_ns, side="right").tolist()
+    taken = [-1] * len(a)  # row of b, of each of a
     for row_a, row_b in zip(i[order].tolist(), j[order].tolist(), strict=True):
-        k = bisect_left(left, row_a)
-        free = k == len(left) or (left[k] != row_a and right[k] > row_b)
-        if free and (k == 0 or right[k - 1] < row_b):
-            left.insert(k, row_a)
-            right.insert(k, row_b)
-    return np.array(left, dtype=np.int64), np.array(right, dtype=np.int64)
+        if taken[row_a] >= 0:
+            continue
+        before = next((k for k in range(row_a - 1, first[row_a] - 1, -1) if taken[k] >= 0), None)
+        after = next((k for k in range(row_a + 1, end[row_a]) if taken[k] >= 0), None)
+        above = before is None or taken[before] < row_b
+        if above and (after is None or taken[after] > row_b):
+            taken[row_a] = row_b
+    rows_b = np.array(taken, dtype=np.int64)
+    rows_a = np.flatnonzero(rows_b >= 0)
+    return rows_a, rows_b[rows_a]
 
 
 def coverage(

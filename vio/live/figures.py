@@ -90,12 +90,13 @@ class LiveMonitor:
         behind.
         """
         now = time.perf_counter()
-        arrived = None
-        while self._arrived and self._arrived[0][0] <= time_ns:
-            arrived = self._arrived.popleft()[1]
-        if arrived is None:
+        # after a reset, times may begin again below that of a frame that never had a result
+        place = next((k for k, (t, _) in enumerate(self._arrived) if t == time_ns), None)
+        if place is None:
             return None
-        latency = now - arrived
+        for _ in range(place):
+            self._arrived.popleft()
+        latency = now - self._arrived.popleft()[1]
         self.results += 1
         self._latencies_s.append(latency)
         self._worst_s = max(self._worst_s, latency)

@@ -234,7 +234,7 @@ class Odometry(EventInputs["Estimate | None"]):
 
         Raises:
             DataError: there is no estimate yet, the size of the rectified images is not known, or
-                they are a cylinder's and the rig of the raw cameras was not given.
+                they are a cylinder's or of one camera and the rig of the raw cameras was not given.
             CalibrationError: no rig of the given lens models is off as the estimate says.
         """
         estimate = self.estimate
@@ -248,6 +248,8 @@ class Odometry(EventInputs["Estimate | None"]):
                 raise DataError(
                     "no lens model holds a cylinder; give Odometry the rig of the raw cameras"
                 )
+            if self.camera.kind != "stereo":
+                raise DataError("one camera was given without its lens; give Odometry its rig")
             raise DataError(
                 "the rectified camera has no image size; give StereoCamera its width and height"
             )

@@ -194,9 +194,8 @@ class MapBuilder:
             self._home = sessions[0].part
         else:
             self._home = self._own
+        # in the file from its first keyframe on
         sessions.append(SessionRow(source, camera, upright, self._own))
-        if not localise:
-            store.add_session(sessions[-1])
         self.places = PlaceFinder(store, self.graph, camera, self._own, writes=not localise)
         self._pending: list[FoundPlace] = []
         self._waiting = 0  # loops since the last optimisation
@@ -250,6 +249,8 @@ class MapBuilder:
         if motion is not None:
             graph.add_motions([(number - 1, number, motion)])
         if not self._localise:
+            if number == self.first:
+                self._store.add_session(graph.sessions[self._own])
             self._store.add_keyframe(row, features)
             if motion is not None:
                 self._store.add_odometry(number - 1, number, motion)
@@ -290,7 +291,7 @@ class MapBuilder:
 
     def commit(self) -> None:
         """Bring everything to the disk as one step."""
-        if self._localise:
+        if self._localise or len(self.graph) == self.first:
             return
         if self._moved:
             T = self.graph.T_map_cam.rows
@@ -384,6 +385,8 @@ class MapBuilder:
             return MapUpdate(
                 None, None, None, events, unconfirmed=any(o.second == k for o in self._pending)
             )
+        if k < self.first:  # an empty map
+            return MapUpdate(np.eye(4), None, np.zeros((6, 6)), events)
         T_map_odom = (
             graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k]) if self._optimised else np.eye(4)
         )

@@ -204,8 +204,13 @@ def _copy_rows(source: MapStore, store: MapStore, kept: BoolArray) -> None:
     rows = source.keyframes()
     owners = np.unique([rows[k].session for k in np.flatnonzero(kept).tolist()]).tolist()
     parts = [sessions[n].part for n in owners]
+    all_parts = [s.part for s in sessions]
     for n in owners:
-        store.add_session(replace(sessions[n], part=parts.index(sessions[n].part)))
+        session = sessions[n]
+        upright = session.upright
+        if n == owners[parts.index(session.part)]:  # the frame stays that of the part's first
+            upright = sessions[all_parts.index(session.part)].upright
+        store.add_session(replace(session, part=parts.index(session.part), upright=upright))
     earth = source.earth()
     if earth is not None and parts[0] == sessions[0].part:  # the frame is the same
         store.set_earth(earth)

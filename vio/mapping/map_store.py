@@ -31,7 +31,8 @@ class SessionRow:
 
     source: str
     camera: StereoCamera
-    upright: bool  # whether z of its odometry frame is up
+    # whether z is up in its odometry's frame; of the first of a part, in that of the part
+    upright: bool
     part: int  # sessions that loops have joined share the number
     # what its stereo calibration is off by; None: not estimated
     field: DisplacementField | None = None

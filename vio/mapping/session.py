@@ -200,7 +200,8 @@ class MapSession:
         fresh = seen.take(seen.has_right & ~seen.stale)
         motion = self._follow(frame, len(fresh), estimate, relative)
         self._most_features = max(self._most_features, len(fresh))
-        if len(fresh) >= min(_CHOICE.min_features, 0.5 * self._most_features):
+        enough = min(_CHOICE.min_features, 0.5 * self._most_features)
+        if len(fresh) and len(fresh) >= enough:
             self._consider(frame, fresh.ids, estimate, motion)
         return events
 

@@ -27,7 +27,7 @@ from vio.dataclass import dataclass
 from vio.findings import CODES, INTEGRITIES, Finding, Integrity, worst
 from vio.geometry.lie import FloatArray, length
 from vio.numerics.robust import median
-from vio.records import NS_PER_S, Estimate
+from vio.records import NS_PER_S, Estimate, IntArray
 
 _HOLDS_NS = NS_PER_S  # an event without an end is one of the second after it
 # findings on the state that was estimated, not on a sensor
@@ -73,6 +73,30 @@ class _Holding:
     until_ns: int | None  # None: until it is said to have ended
 
 
+class _FrameTimes:
+    """Numbers and times of all frames so far, in 16 bytes each: a live run has no end."""
+
+    def __init__(self) -> None:
+        self._rows: IntArray = np.zeros((64, 2), dtype=np.int64)
+        self._count = 0
+
+    def add(self, index: int, time_ns: int) -> None:
+        """Add a frame after the others, or replace the last one."""
+        if not self._count or self._rows[self._count - 1, 0] != index:
+            self._count += 1
+        if self._count > len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._rows[self._count - 1] = index, time_ns
+
+    def of(self, index: int) -> int | None:
+        """Return the time of a frame; None: it had no estimate."""
+        known = self._rows[: self._count]
+        place = int(np.searchsorted(known[:, 0], index))
+        if place < len(known) and known[place, 0] == index:
+            return int(known[place, 1])
+        return None
+
+
 class IntegrityMonitor:
     """Collects findings, and judges each estimate by those that hold."""
 
@@ -82,7 +106,7 @@ class IntegrityMonitor:
         self._marks: list[Mark] = []
         self._last: tuple[int, FloatArray] | None = None  # time and position of the last frame
         self._speed_mps = _MIN_SPEED_MPS  # the fastest so far
-        self._times = dict[int, int]()  # of the frames so far, by their numbers
+        self._times = _FrameTimes()
         self._unusable_since_ns: int | None = None
         self._carried_m = 0.0  # that the position may be off by since earlier faults
         self._doubt_m = 0.0  # the same with the present one
@@ -176,7 +200,7 @@ class IntegrityMonitor:
         """Return the estimate of a frame with its integrity and, where it is not nominal, the codes
         of what holds.
         """
-        self._times[index] = estimate.time_ns
+        self._times.add(index, estimate.time_ns)
         self._update(index, estimate.time_ns)
         held = [entry.finding for entry in self._holding.values()]
         integrity = worst([finding.effect for finding in held])
@@ -226,9 +250,8 @@ class IntegrityMonitor:
     def _onset_ns(self, finding: Finding, now_ns: int) -> int:
         """The time of the first frame that a finding holds for."""
         first = finding.first_frame
-        if first is None:
-            return now_ns
-        return self._times.get(first, now_ns)
+        known = None if first is None else self._times.of(first)
+        return now_ns if known is None else known
 
     def _update(self, index: int, now_ns: int) -> None:
         """Take the new findings, and let go of those that have ended."""
