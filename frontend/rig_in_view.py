@@ -4,7 +4,9 @@ rig and not the scene.
 An arm, a bonnet or the cabin around a camera may show more features than the scene. Then they win
 the consensus of each frame, the scene's are left out as outliers, and the rig seems to stand still.
 At standstill objects move, too, but those are nearer than the scene behind them, and cover a part of
-the image. What comes onto a window or a lens at once may leave no feature of the scene at all.
+the image. One that covers most of it from the first frame on wins the consensus in the same way, and
+the scene behind it, or all around it, stays. What comes onto a window or a lens at once may leave no
+feature of the scene at all.
 """
 
 from __future__ import annotations
@@ -50,6 +52,32 @@ _CODE = "rig-in-view"
 _STILL = np.eye(4)
 
 
+class _BeforeScene:
+    """Whether the consensus is that of an object before a scene that stays, since the first frames in
+    which it moves.
+    """
+
+    def __init__(self) -> None:
+        self._recent = deque[bool](
+            maxlen=_RIG.recent_frames
+        )  # frames in which it moves, or after that
+        self.stands = False
+
+    @property
+    def done(self) -> bool:
+        """Whether it was the scene's in the first frames."""
+        is_full = len(self._recent) == _RIG.recent_frames
+        return is_full and not self.stands and sum(self._recent) < _RIG.frames
+
+    def see(self, is_before: bool) -> bool:
+        """Take whether it is in a frame; return whether that begins or ends with it."""
+        self._recent.append(is_before)
+        count = sum(self._recent)
+        stood = self.stands
+        self.stands = count > 0 if stood else count >= _RIG.frames
+        return self.stands != stood
+
+
 class RigInView(Finder):
     """Reports that the consensus may be that of parts of the rig, until it moves."""
 
@@ -61,6 +89,7 @@ class RigInView(Finder):
         self._replaced = False  # in that frame, all else was lost, and nothing has moved since
         self._moved = 0  # frames in which the consensus moves
         self._recent = deque[bool](maxlen=_RIG.recent_frames)
+        self._before = _BeforeScene()
         self._reported = False
         self._last: tuple[int, int, bool] | None = None  # frame, points, and whether as usual
 
@@ -96,12 +125,21 @@ class RigInView(Finder):
         if not stays.any():
             return
         self._seen = points, stays
-        if self._moved >= _RIG.moved_frames:
-            return
-        if _flow_px(problem.camera, points, stays) > _RIG.still_px:
-            self._moves(index)
+        if self._moved >= _RIG.moved_frames and self._before.done:
             return
         flow_px = pixel_errors(problem.camera, _STILL, points.p_prev, points.pixels)
+        moves = median(flow_px[stays]) > _RIG.still_px
+        if not self._before.done and (moves or self._before.stands):
+            behind = ~stays & (flow_px <= problem.limit_px)
+            told = moves and measured is None
+            is_before = told and _is_scene(problem, points, stays, behind)
+            if self._before.see(is_before):
+                self._report_before(index, float(behind.mean()))
+        if self._moved >= _RIG.moved_frames:
+            return
+        if moves:
+            self._moves(index)
+            return
         scene = ~stays & (flow_px > problem.limit_px)
         is_rig = self._replaced or _is_scene(problem, points, stays, scene)
         if is_rig and measured is not None:
@@ -135,6 +173,19 @@ class RigInView(Finder):
             )
             self._found.append(Finding(_CODE, message, index, ended=True))
 
+    def _report_before(self, index: int, share: float) -> None:
+        if not self._before.stands:
+            message = f"frame {index}: no points stay behind those that move any more"
+            self._found.append(Finding(_CODE, message, index, ended=True))
+            return
+        message = (
+            f"frame {index}: {100 * share:.0f} % of the points have stayed at the same pixels since "
+            f"frame {self._since}, behind or all over those that are taken for the scene: these may be "
+            "of something that moves before a rig that stands still"
+        )
+        figures = {"scene_share": share}
+        self._found.append(Finding(_CODE, message, index, self._since, lasts=True, figures=figures))
+
     def _report(self, index: int, share: float) -> None:
         self._reported = True
         what = (
@@ -159,18 +210,18 @@ def _flow_px(camera: StereoCamera, points: MovedPoints, chosen: BoolArray) -> fl
 
 
 def _is_scene(
-    problem: RansacProblem, points: MovedPoints, stays: BoolArray, scene: BoolArray
+    problem: RansacProblem, points: MovedPoints, consensus: BoolArray, scene: BoolArray
 ) -> bool:
-    """Whether points (N,) that move follow one motion, behind those that stay and as wide or high,
-    or all over them.
+    """Whether points (N,) of the `scene` follow one motion, behind those of the consensus and as wide
+    or high, or all over them.
     """
     count = int(scene.sum())
     if count < max(_RIG.min_points, _RIG.min_share * len(scene)):
         return False
     depth = depth_of(problem.camera, points.p_prev)
-    is_behind = median(depth[stays]) <= _RIG.nearer * median(depth[scene])
+    is_behind = median(depth[consensus]) <= _RIG.nearer * median(depth[scene])
     apart_px = points.pixels[scene].std(axis=0)
-    is_wide = apart_px >= _RIG.spread * points.pixels[stays].std(axis=0)
+    is_wide = apart_px >= _RIG.spread * points.pixels[consensus].std(axis=0)
     if not (is_wide.any() if is_behind else is_wide.all()):
         return False
     _, follows = best_motion(problem, points.p_prev[scene], points.pixels[scene], _STILL[None])

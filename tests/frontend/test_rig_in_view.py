@@ -160,6 +160,49 @@ def test_it_ends_once_the_consensus_moves() -> None:
     ]
 
 
+ASIDE = se3_exp([0.06, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def _object_before(
+    frames: range,
+    check: RigInView,
+    behind: tuple[float, float] = FAR,
+    motion: FloatArray = ASIDE,
+    measured: FloatArray | None = None,
+) -> list[tuple[int | None, bool]]:
+    """Findings on frames in which the consensus is that of what moves before a scene that stays."""
+    found = []
+    for k in frames:
+        points = scene(200, k, CLOSE), scene(30, 100 + k, behind)
+        found += _see(check, k, *points, (motion, REST), measured=measured)
+    return [(f.frame, f.ended) for f in found]
+
+
+def test_an_object_over_most_of_the_view_from_the_first_frame_on_is_named() -> None:
+    check = RigInView()
+    assert _object_before(range(1, 20), check) == [(5, False)]
+    # it stops: the view stays, and ten frames later nothing is behind what moves any more
+    assert _object_before(range(20, 40), check, motion=REST) == [(29, True)]
+
+
+def test_a_part_of_the_rig_before_a_scene_that_moves_is_no_scene() -> None:
+    check = RigInView()
+    for k in range(1, 30):
+        near = _part(scene(30, 100 + k, (0.6, 0.9)))
+        assert not _see(check, k, scene(200, k, FAR), near, (STEP, REST))
+
+
+def test_a_sensor_that_measures_motion_is_believed_beside_what_stays() -> None:
+    assert _object_before(range(1, 30), RigInView(), measured=ASIDE) == []
+
+
+def test_what_stays_behind_a_rig_that_moved_first_is_no_scene() -> None:
+    check = RigInView()
+    for k in range(1, 15):
+        assert not _see(check, k, scene(200, k, FAR), NONE, (STEP, STEP))
+    assert _object_before(range(15, 40), check) == []
+
+
 def _replaced(
     before: FloatArray,
     after: FloatArray,

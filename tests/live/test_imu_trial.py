@@ -15,6 +15,7 @@ import pytest
 
 from tests.monitor.test_inertial_check import Watched, _recording
 from vio import evaluate, load_config, run
+from vio.findings import INTEGRITIES
 from vio.geometry.lie import so3_exp
 from vio.imu.findings import ImuVerdict, InertialFinding
 from vio.live.odometry import Odometry
@@ -111,6 +112,8 @@ def test_a_unit_is_applied_from_the_start(
     first, last = [line for line in result.warnings if "estimated again" in line]
     assert "is not used until" in first
     assert "readings are multiplied by" in last
+    for table in (result.estimates, result.frames):
+        assert np.all(np.array(table.column("integrity")) == INTEGRITIES.index("nominal"))
     written = (tmp_path / "run" / "trajectory.tum").read_text().splitlines()
     assert sum(not row.startswith("#") for row in written) == FRAMES
     assert np.allclose(

@@ -84,7 +84,9 @@ def test_innovations_beyond_what_is_stated_inflate_the_covariance() -> None:
     assert variances(6.0, [4e-4, 4e-4, 4e-4, 4e-4, 5e-4])[-1] == pytest.approx(5e-4 + 8e-4)
     assert variances(1.0, 6 * [5e-4])[-1] == pytest.approx(5e-4 + 8e-4)
     assert variances(1.0, [2.5e-4])[-1] == pytest.approx(2.5e-4 + 4e-4)
-    monitor.begin_again()
+    again = IntegrityMonitor()
+    again.go_on_from(monitor, [])
+    monitor = again
     assert variances(1.0, [2.5e-4]) == [2.5e-4]
 
 
@@ -156,7 +158,7 @@ def test_frames_before_a_fault_was_found_are_marked() -> None:
     judge(monitor, range(8, 9))
     assert monitor.take_marks() == (Mark(5, 8, "degraded", "right-contradicts-left"),)
     assert monitor.take_marks() == ()
-    late = marked(estimate(6), Mark(5, 8, "unusable", "pairs-shifted"), 3.0)
+    late = marked(estimate(6), Mark(5, 8, "unusable", "pairs-shifted", share=1.0), 3.0)
     assert late.integrity == "unusable"
     assert late.covariance[1, 1] == pytest.approx(9.0, rel=1e-3)
 
@@ -304,3 +306,20 @@ def test_an_hour_of_frames_takes_little_memory() -> None:
     held = monitor.judged(count, estimate(count))
     moved_m = 2.0 * (count - 10) * STEP_NS * 1e-9
     assert np.sqrt(held.covariance[0, 0]) == pytest.approx(moved_m, rel=1e-3)
+
+
+def test_a_share_of_the_motion_stays_in_doubt_after_its_finding_has_ended() -> None:
+    """0.2 m a frame, of which a quarter is in doubt from frame 4 to 9."""
+    monitor = IntegrityMonitor()
+    judge(monitor, range(6))
+    figures = {"doubted_share": 0.25}
+    monitor.take(Finding("tracks-disagree", "", 6, 4, lasts=True, figures=figures))
+    held = judge(monitor, range(6, 10))
+    monitor.take(Finding("tracks-disagree", "", 10, ended=True))
+    after = judge(monitor, range(10, 20))
+    assert {e.integrity for e in held} == {"degraded"}
+    assert {e.integrity for e in after} == {"nominal"}
+    sigmas = [float(np.sqrt(e.covariance[0, 0])) for e in (*held, *after)]
+    assert sigmas[0] == pytest.approx(0.25 * 0.4, rel=0.01)
+    assert sigmas[3:] == pytest.approx(11 * [0.25 * 1.0], rel=0.01)
+    assert monitor.take_marks() == (Mark(4, 6, "degraded", "tracks-disagree", share=0.25),)

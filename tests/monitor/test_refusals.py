@@ -103,7 +103,7 @@ def test_an_imu_that_is_not_used_any_more_predicts_nothing(usable: bool) -> None
         RunMonitor(StereoCamera(400, 400, 320, 240, 0.1), np.eye(4), imu=True),
         np.arange(len(_PIXELS)),
     )
-    monitor.begun_again(0, ImuVerdict(usable=usable), 1)
+    monitor.begun_again(0, ImuVerdict(usable=usable), [])
     for k in range(1, 40):
         seen = observations(k, k * 50_000_000, ids, np.concatenate([_PIXELS, _PIXELS], axis=1))
         monitor.observations(seen)

@@ -209,9 +209,9 @@ class FramePipeline:
         again = trial.again(verdict)
         if again is None:
             return
-        self.backend, self._revised = again
+        self.backend, frames = again
         self._imu = verdict
-        self.monitor.begun_again(index, verdict, len(self._revised))
+        self._revised = self.monitor.begun_again(index, verdict, frames)
 
     def newest(self, index: int, estimate: Estimate | None) -> Estimate | None:
         """Return the estimate of a frame, or the one that has replaced it and was not taken yet."""

@@ -19,9 +19,10 @@ import numpy as np
 from vio.errors import DivergedError, EstimationError
 from vio.geometry.lie import so3_exp
 from vio.imu.findings import ImuVerdict
+from vio.monitor.update_checks import UpdatedFrame
 from vio.numerics.kinds import Capacity
 from vio.protocols import Backend
-from vio.records import Estimate, ImuSample, MotionSample, Observations
+from vio.records import ImuSample, MotionSample, Observations
 
 _MAX_FRAMES: Capacity[int] = 600  # that are kept
 AS_GIVEN = ImuVerdict()
@@ -60,11 +61,11 @@ class ImuTrial:
         if self._frames > _MAX_FRAMES:
             self.close()
 
-    def again(self, verdict: ImuVerdict) -> tuple[Backend, dict[int, Estimate]] | None:
+    def again(self, verdict: ImuVerdict) -> tuple[Backend, list[UpdatedFrame]] | None:
         """Give everything to a new back end, with the IMU that a verdict leaves; but for a doubt and
         its end, nothing can be taken again then.
 
-        Return that back end and its estimates by frame number; None: it is lost, too.
+        Return that back end and its frames; None: it is lost, too.
         """
         backend = self._fresh
         taken = self._taken
@@ -74,17 +75,17 @@ class ImuTrial:
         else:
             self.close()
         try:
-            return backend, _estimates(backend, taken, verdict)
+            return backend, _frames(backend, taken, verdict)
         except EstimationError:
             self.close()
             return None
 
 
-def _estimates(
+def _frames(
     backend: Backend, taken: list[MotionSample | Observations], verdict: ImuVerdict
-) -> dict[int, Estimate]:
-    """Give everything to a back end; return its estimates by frame number."""
-    estimates = {}
+) -> list[UpdatedFrame]:
+    """Give everything to a back end; return the frames that have an estimate."""
+    frames = []
     for event in taken:
         if isinstance(event, Observations):
             try:
@@ -92,10 +93,10 @@ def _estimates(
             except DivergedError:
                 report = backend.restart(event)
             if report.started:
-                estimates[event.frame_index] = backend.estimate()
+                frames.append(UpdatedFrame(event, report, backend.estimate()))
         elif (sample := corrected(event, verdict)) is not None:
             backend.propagate(sample)
-    return estimates
+    return frames
 
 
 def corrected_all(samples: Sequence[MotionSample], verdict: ImuVerdict) -> Sequence[MotionSample]:

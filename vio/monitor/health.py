@@ -115,10 +115,11 @@ class RunHealth:
         )
         return (Finding("estimate-restarted", message, index, figures={"sigma_m": sigma}),)
 
-    def begun_again(self) -> None:
-        """Forget what was found of a state that another one has replaced from the first frame on."""
-        self._last = None
-        self._reported -= {*_SCALES, *_STATE}
+    def begin_again(self, before: RunHealth) -> None:
+        """Take what was found before, but for a state that another one has replaced from the first
+        frame on.
+        """
+        self._reported = before._reported - {*_SCALES, *_STATE}
 
     def begun_anew(self, index: int, good_ns: int, estimate: Estimate) -> Finding:
         """Return the finding on a new start from the sensors, with an estimate after it; what was

@@ -4,7 +4,8 @@ A covariance is conditional on what the filter assumes. Where a finding says tha
 not hold, the estimate is marked, and the covariance of one that is unusable also covers that the
 rig has moved in any direction since the fault began, as fast as it moves at most: what the filter
 says of the motion since then may be wrong by all of it. When the fault has ended, the motion is
-known again, and the position is not: what the covariance covered stays in it.
+known again, and the position is not: what the covariance covered stays in it. Where a finding doubts
+a share of the motion, that is so of this share.
 
 Where features lie further from their predictions by the IMU than the filter expects, frame after
 frame, its new errors are larger by as much as far as anyone can say, whatever the cause is: what the
@@ -18,6 +19,7 @@ pass for knowledge of it. So distances from there on are uncertain by a walk of 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -31,7 +33,7 @@ from vio.records import NS_PER_S, Estimate, IntArray
 
 _HOLDS_NS = NS_PER_S  # an event without an end is one of the second after it
 # findings on the state that was estimated, not on a sensor
-_OF_THE_STATE = ("estimate-implausible", "estimate-restarted", "estimate-lost", "scale-off")
+OF_THE_STATE = ("estimate-implausible", "estimate-restarted", "estimate-lost", "scale-off")
 _MIN_SPEED_MPS = 0.1  # of a rig that stands still as far as the estimate says
 # Levels of what the scale may be off by, over it: the first one, and from one to the next. Where
 # one is reached, earlier frames below it are brought to it.
@@ -63,6 +65,7 @@ class Mark:
     integrity: Integrity
     code: str | None  # of the finding; None: there is none, the covariance alone changes
     scale: float = 0.0  # standard deviation of distances from the first pose, over them
+    share: float = 0.0  # of the motion since the first frame that positions may be off by
 
 
 @dataclass(slots=True)
@@ -107,7 +110,8 @@ class IntegrityMonitor:
         self._last: tuple[int, FloatArray] | None = None  # time and position of the last frame
         self._speed_mps = _MIN_SPEED_MPS  # the fastest so far
         self._times = _FrameTimes()
-        self._unusable_since_ns: int | None = None
+        self._doubted_since_ns: int | None = None
+        self._doubted_share = 0.0  # the largest since then
         self._carried_m = 0.0  # that the position may be off by since earlier faults
         self._doubt_m = 0.0  # the same with the present one
         # innovations over their standard deviations by a motion sensor
@@ -168,19 +172,13 @@ class IntegrityMonitor:
         elif measured is not None:
             self._unscaled[0, 0] += _SCALE_WALK**2
 
-    def begin_again(self) -> None:
-        """Forget what was judged of a state that another one replaces from the first frame on."""
-        self._ratios.clear()
-        self._misled_m = 0.0
-        self._last = None
-        self._speed_mps = _MIN_SPEED_MPS
-        self._unusable_since_ns = None
-        self._carried_m = 0.0
-        self._doubt_m = 0.0
-        self._unscaled = np.zeros((4, 4))
-        for code in _OF_THE_STATE:
-            self._holding.pop(code, None)
-        self._new = [finding for finding in self._new if finding.code not in _OF_THE_STATE]
+    def go_on_from(self, other: IntegrityMonitor, new: Sequence[Finding]) -> None:
+        """Go on where another one, of estimates that were replaced, has come to: what it knows of the
+        sensors holds, and findings are new to both.
+        """
+        held = {code: entry for code, entry in other._holding.items() if code.startswith("imu-")}
+        self._holding |= held
+        self._new = list(new)
 
     def take_marks(self) -> tuple[Mark, ...]:
         """Return the marks of earlier frames since the last call."""
@@ -193,7 +191,7 @@ class IntegrityMonitor:
         for finding in self._new:
             since = finding.first_frame
             if finding.effect != "nominal" and since is not None and since < index:
-                self._marks.append(Mark(since, index + 1, finding.effect, finding.code))
+                self._marks.append(_mark(finding, since, index + 1))
         self._new = []
 
     def judged(self, index: int, estimate: Estimate) -> Estimate:
@@ -221,15 +219,19 @@ class IntegrityMonitor:
 
     def _measure_doubt(self, now_ns: int, held: list[Finding]) -> None:
         """Bring what the position may be off by to the present."""
-        since = [self._onset_ns(f, now_ns) for f in held if f.effect == "unusable"]
-        if not since:
-            self._unusable_since_ns = None
+        doubted = [f for f in held if _doubted_share(f) > 0.0]
+        if not doubted:
+            self._doubted_since_ns = None
+            self._doubted_share = 0.0
             self._carried_m = self._doubt_m
             return
-        if self._unusable_since_ns is None:
-            self._unusable_since_ns = now_ns
-        self._unusable_since_ns = min(self._unusable_since_ns, *since)
-        moved_m = self._speed_mps * (now_ns - self._unusable_since_ns) / NS_PER_S
+        if self._doubted_since_ns is None:
+            self._doubted_since_ns = now_ns
+        since = [self._onset_ns(f, now_ns) for f in doubted]
+        self._doubted_since_ns = min(self._doubted_since_ns, *since)
+        self._doubted_share = max(self._doubted_share, *map(_doubted_share, doubted))
+        fastest_m = self._speed_mps * (now_ns - self._doubted_since_ns) / NS_PER_S
+        moved_m = self._doubted_share * fastest_m
         self._doubt_m = float(np.hypot(self._carried_m, moved_m))
 
     def _measure_misled(self, covariance: FloatArray) -> None:
@@ -271,7 +273,7 @@ class IntegrityMonitor:
                 self._holding[finding.code] = _Holding(finding, until_ns)
             since = finding.first_frame
             if since is not None and since < index:
-                self._marks.append(Mark(since, index, finding.effect, finding.code))
+                self._marks.append(_mark(finding, since, index))
         self._new = []
 
     def _measure_speed(self, estimate: Estimate, *, usable: bool) -> None:
@@ -286,6 +288,18 @@ class IntegrityMonitor:
             moved[1:, 0] = position - last[1]
             self._unscaled = moved @ self._unscaled @ moved.T
         self._speed_mps = max(self._speed_mps, step_m * NS_PER_S / (estimate.time_ns - last[0]))
+
+
+def _doubted_share(finding: Finding) -> float:
+    """Share of the motion, while a finding holds, that the estimate may be off by."""
+    if finding.effect == "unusable":
+        return 1.0
+    return finding.figures.get("doubted_share", 0.0)
+
+
+def _mark(finding: Finding, since: int, before: int) -> Mark:
+    share = _doubted_share(finding)
+    return Mark(since, before, finding.effect, finding.code, share=share)
 
 
 def _scale_doubt(level: int) -> float:
@@ -311,6 +325,6 @@ def marked(estimate: Estimate, mark: Mark, sigma_m: float) -> Estimate:
     if mark.code is not None:
         codes = tuple(sorted({*codes, mark.code}))
     covariance = estimate.covariance
-    if mark.integrity == "unusable" or mark.scale > 0.0:
+    if mark.share > 0.0 or mark.scale > 0.0:
         covariance = inflated(covariance, sigma_m)
     return replace(estimate, integrity=integrity, findings=codes, covariance=covariance)

@@ -2,7 +2,8 @@
 
 What moves by itself, more slowly than an outlier, is part of the consensus, and the estimate is a
 compromise: all tracks fit worse than before, while each patch fits as well as ever. Where noise or
-blur set in, patches fit worse as well, and errors are as large as they say.
+blur set in, patches fit worse as well, and errors are as large as they say. The motion is doubted by
+the share of the tracks, or of their variance, that it does not explain.
 """
 
 from __future__ import annotations
@@ -116,7 +117,8 @@ def _begun(index: int, since: int, excess: float) -> Finding:
         f"explain ({excess:.1f} times the variance): something moves with the rig or by itself, "
         "slowly or in much of the image, and the motion may be a compromise with it"
     )
-    return Finding(_CODE, message, index, since, lasts=True, figures={"excess": excess})
+    figures = {"excess": excess, "doubted_share": 1.0 - 1.0 / excess}
+    return Finding(_CODE, message, index, since, lasts=True, figures=figures)
 
 
 def _apart(index: int, apart: Apart) -> Finding:
@@ -126,5 +128,5 @@ def _apart(index: int, apart: Apart) -> Finding:
         "of the rig, a mirror or a reflection is in view, or an object moves slowly, and the motion "
         "may be a compromise with it"
     )
-    figures = {"second_share": apart.share}
+    figures = {"second_share": apart.share, "doubted_share": apart.share}
     return Finding(_CODE, message, index, apart.since, lasts=True, figures=figures)

@@ -5,7 +5,7 @@ readings.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -18,16 +18,12 @@ from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import AS_READ
 from vio.imu.findings import ImuVerdict
 from vio.imu.settings import DEFAULT_IMU
-from vio.monitor.contradiction import ImuContradiction
-from vio.monitor.frame_order import FrameOrder
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
-from vio.monitor.health import RefusalReport, RunHealth, is_corrected
-from vio.monitor.image_geometry import ImageGeometry
+from vio.monitor.health import is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
-from vio.monitor.integrity import IntegrityMonitor, Mark
-from vio.monitor.misfit import TrackMisfit
+from vio.monitor.integrity import OF_THE_STATE, IntegrityMonitor, Mark
 from vio.monitor.still_features import StillFeatures
-from vio.monitor.view_change import ViewChange
+from vio.monitor.update_checks import UpdateChecks, UpdatedFrame
 from vio.records import (
     Estimate,
     Image,
@@ -49,6 +45,8 @@ log = logging.getLogger(__name__)
 _DOUBT = "imu-in-doubt"
 # groups of faults without whose cure one camera finds no scale
 _PREVENTS_START = ("size", "overlap")
+# what holds of an IMU's samples, however they are read
+_OF_SAMPLES = ("imu-gap", "imu-readings", "imu-saturated")
 
 
 class RunMonitor:
@@ -69,24 +67,15 @@ class RunMonitor:
         """Create the monitors of a rectified pair; extrinsics (4, 4), which the filter estimates if
         they are not known; `imu`: raw samples propagate the pose.
         """
-        self._health = RunHealth()
-        self._refusals = RefusalReport(imu=imu)
-        self._views = ViewChange()
-        self._order = FrameOrder()
+        self._updates = UpdateChecks(camera, imu=imu)
+        self._of_updates = set[int]()  # places of their findings among all
         self._still = StillFeatures()
         self._image: Image | None = None  # left one of the present frame
-        self._geometry = ImageGeometry(camera)
-        self._misfit = TrackMisfit()
-        from vio.guard.two_motions import TwoMotions  # loads OpenCV
-
-        self._motions = TwoMotions(camera)
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
         self._faults = ImuFaultReport() if imu else None
-        # of one camera, the scale is the IMU's own
-        self._contradiction = ImuContradiction() if imu and camera.kind != "mono" else None
         self._frozen = FrozenImages()
         self._repeats = RepeatReport(IMAGES)
         self._depths = RepeatReport(DEPTHS)
@@ -287,19 +276,48 @@ class RunMonitor:
         """Whether units, axes and signs of the IMU are not compared any more."""
         return self._inertial is None or self._inertial.done
 
-    def begun_again(self, index: int, verdict: ImuVerdict, frames: int) -> None:
-        """Report that the frames so far were estimated again with what is left of the IMU."""
-        self._goes_on(index, verdict, f"; the {frames} frames so far were estimated again")
-        if self._contradiction is not None:
-            self._add(self._contradiction.end(index))
-        self._health.begun_again()
-        self._integrity.begin_again()
+    def begun_again(
+        self, index: int, verdict: ImuVerdict, frames: Sequence[UpdatedFrame]
+    ) -> dict[int, Estimate]:
+        """Report that the frames so far were estimated again with what is left of the IMU; return
+        their estimates by number, with the integrity that the images leave them.
+        """
+        self._goes_on(index, verdict, f"; the {len(frames)} frames so far were estimated again")
+        if self._updates.contradiction is not None:
+            self._add(self._updates.contradiction.end(index))
+        self._updates = self._updates.anew(imu=verdict.used)
+        return self._judged_again(frames, verdict)
+
+    def _judged_again(
+        self, frames: Sequence[UpdatedFrame], verdict: ImuVerdict
+    ) -> dict[int, Estimate]:
+        """Judge estimates that replace those before: what was found of images and samples stays, and
+        what was found by the updates is found anew.
+        """
+        known = {finding.message for finding in self.findings}
+        stays = [f for k, f in enumerate(self.findings) if k not in self._of_updates]
+        before = self._integrity
+        self._integrity = IntegrityMonitor()
+        estimates: dict[int, Estimate] = {}
+        for frame in frames:
+            assert frame.seen is not None
+            index = frame.seen.frame_index
+            while stays and (stays[0].frame is None or stays[0].frame <= index):
+                finding = stays.pop(0)
+                if _stays(finding, verdict):
+                    self._integrity.take(finding)
+            shown = bool(frame.seen.has_right.any()) if len(frame.seen) else None
+            has_scale = True if verdict.used else shown
+            self._judge_update(index, frame, has_scale, measured=verdict.used, known=known)
+            estimates[index] = self._integrity.judged(index, frame.estimate)
+        self._integrity.go_on_from(before, stays)
+        return estimates
 
     def goes_on_from(self, index: int, verdict: ImuVerdict) -> None:
         """Report that the run goes on from a frame with what is left of the IMU; what it has done to
         the estimate since it has been compared stays, and is in the covariance.
         """
-        was_used = self._refusals.imu
+        was_used = self._updates.refusals.imu
         self._goes_on(index, verdict)
         if self._inertial is None or verdict.used or not was_used:
             return
@@ -309,7 +327,7 @@ class RunMonitor:
 
     def _goes_on(self, index: int, verdict: ImuVerdict, more: str = "") -> None:
         """Report what is left of the IMU."""
-        self._refusals.imu = verdict.used
+        self._updates.refusals.imu = verdict.used
         what = "the IMU is not used, and images alone go on"
         if verdict.in_doubt:
             what = "the IMU is not used until motion shows what is wrong with it"
@@ -361,7 +379,7 @@ class RunMonitor:
         """Report that the back end diverged in a frame and was started again; repeats within a
         second are one event.
         """
-        self._add(self._health.restarted(index, why, estimate))
+        self._add(self._updates.health.restarted(index, why, estimate))
 
     def begun_anew(self, index: int, good_ns: int, estimate: Estimate) -> None:
         """Report that the back end was begun anew in a frame, as its state was impossible; `good_ns`
@@ -369,7 +387,7 @@ class RunMonitor:
         """
         self._scale_lines = []
         self._integrity.end_since(good_ns, "scale-off")
-        self._add([self._health.begun_anew(index, good_ns, estimate)])
+        self._add([self._updates.health.begun_anew(index, good_ns, estimate)])
 
     def update(
         self,
@@ -383,37 +401,47 @@ class RunMonitor:
         """Add the back end's report and estimate of a frame; `has_scale`: whether its features or a
         motion sensor measure lengths, None: it shows nothing; `measured`: whether a sensor does.
         """
-        self._integrity.take_scale(measured=has_scale)
-        self._add(self._health.frame(index, report, estimate))
-        innovation = report.innovation_ratio if measured else None
-        self._add(self._order.frame(index, estimate.T_world_imu[:3, 3], innovation))
-        if self._contradiction is not None:
-            self._add(self._contradiction.frame(index, report.innovation_ratio))
-            self._integrity.take_innovation(report.innovation_ratio)
+        self._judge_update(
+            index, UpdatedFrame(self._seen, report, estimate), has_scale, measured=measured
+        )
         if report.gyro_jump_radps is not None and self._inertial is not None:
             self._inertial.begin_after_jump(index)
-        self._integrity.take_scale_doubt(index, report.scale_doubt)
         if self._seen is not None:
-            ratio = report.innovation_ratio
-            imu = self._refusals.imu
-            if self._contradiction is not None:
-                imu = imu and not self._contradiction.stands
-            self._add(self._views.frame(self._seen, ratio, measured=measured, imu=imu))
-            self._add(self._geometry.frame(self._seen, ratio))
-            self._add(self._refusals.frame(self._seen, report, estimate))
             flow_px = None if measured else self._frozen.flow_px
             self._add(self._still.frame(index, self._image, flow_px))
-            misfit = None if measured else report.misfit
-            self._add(self._misfit.frame(self._seen, misfit, self._motions.frame(self._seen)))
-        self._scale_lines += self._health.scale(index, estimate)
+        self._scale_lines += self._updates.health.scale(index, estimate)
         if self._inertial is not None:
             offset_s = self._inertial.clock_offset_s
             since = self._inertial.compared_since
-            apart = self._health.clock(index, estimate, offset_s, since)
+            apart = self._updates.health.clock(index, estimate, offset_s, since)
             self._add(apart)
             if apart and self.can_begin_again:  # by images alone; else the filter is begun anew
                 self.imu_verdict = replace(self.imu_verdict, usable=False)
         self._report_scale(last=False)
+
+    def _judge_update(
+        self,
+        index: int,
+        frame: UpdatedFrame,
+        has_scale: bool | None,
+        *,
+        measured: bool,
+        known: Set[str] = frozenset(),
+    ) -> None:
+        """Judge a frame by its update, as often as it is estimated; messages that are known already
+        are not reported again.
+        """
+        self._integrity.take_scale(measured=has_scale)
+        first = len(self.findings)
+        for finding in self._updates.frame(index, frame, measured=measured):
+            if finding.message in known:
+                self._integrity.take(finding)
+            else:
+                self._add([finding])
+        self._of_updates.update(range(first, len(self.findings)))
+        if self._updates.contradiction is not None:
+            self._integrity.take_innovation(frame.report.innovation_ratio)
+        self._integrity.take_scale_doubt(index, frame.report.scale_doubt)
 
     def _report_scale(self, *, last: bool) -> None:
         """Report what the sensor says of the cameras' scale once its axes were compared, and are
@@ -508,3 +536,12 @@ class RunMonitor:
     def take_marks(self) -> tuple[Mark, ...]:
         """Return which earlier frames are to be marked, as a fault began before it was found."""
         return self._integrity.take_marks()
+
+
+def _stays(finding: Finding, verdict: ImuVerdict) -> bool:
+    """Whether a finding, which no update showed, holds of frames that are estimated again with what
+    a verdict leaves of the IMU.
+    """
+    if finding.code.startswith("imu-"):
+        return verdict.used and finding.code in _OF_SAMPLES
+    return finding.code not in OF_THE_STATE

@@ -216,8 +216,9 @@ class RunRecorder:
             known = table.rows()["index"].tolist()
             rows = [k for k, index in enumerate(known) if index in estimates]
             self._keep_rows("estimates", rows)
+            self._keep_rows("frames", rows)
             for k in rows:
-                table.replace(k, estimate_row(known[k], estimates[known[k]]))
+                self._replace(k, known[k], estimates[known[k]])
         self._written = 0
         self._saved_s = -np.inf  # the last checkpoint is that of other rows
 
@@ -226,7 +227,6 @@ class RunRecorder:
         if not marks or not self._tables:
             return
         estimates = self._tables["estimates"]
-        frames = self._tables["frames"]
         with self._writing():
             for mark in marks:
                 rows = np.array(estimates.rows())
@@ -237,12 +237,17 @@ class RunRecorder:
                 self._keep_rows("frames", marked_rows)
                 for k in marked_rows:
                     estimate = marked(estimate_of(rows[k]), mark, sigma_m[k])
-                    estimates.replace(k, estimate_row(int(rows["index"][k]), estimate))
-                    log_row = np.array(frames.rows(k, k + 1))
-                    log_row["integrity"] = INTEGRITIES.index(estimate.integrity)
-                    frames.replace(k, log_row)
+                    self._replace(k, int(rows["index"][k]), estimate)
         self._written = 0
         self._saved_s = -np.inf  # the last checkpoint is that of other rows
+
+    def _replace(self, row: int, index: int, estimate: Estimate) -> None:
+        """Replace the estimate of a frame in its row of the tables."""
+        self._tables["estimates"].replace(row, estimate_row(index, estimate))
+        frames = self._tables["frames"]
+        log_row = np.array(frames.rows(row, row + 1))
+        log_row["integrity"] = INTEGRITIES.index(estimate.integrity)
+        frames.replace(row, log_row)
 
     def flush(self) -> None:
         """Bring all that is final to the disk: the tables, trajectory.tum and frames.csv."""
@@ -495,7 +500,7 @@ def _may_be_off_m(rows: Rows, held: BoolArray, mark: Mark) -> FloatArray:
         position = rows["T_world_imu"][:, :3, 3]
         return np.asarray(mark.scale * np.linalg.norm(position - position[0], axis=1))
     elapsed_s = (rows["time_ns"] - rows["time_ns"][held][0]) / NS_PER_S
-    return np.asarray(_fastest_mps(rows) * elapsed_s)
+    return np.asarray(mark.share * _fastest_mps(rows) * elapsed_s)
 
 
 def _fastest_mps(rows: Rows) -> float:
