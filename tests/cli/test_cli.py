@@ -530,6 +530,9 @@ def test_an_unknown_option_shows_the_usage_of_its_command(
     ("argv", "hint"),
     [
         (["inspct", "x"], "there is no command 'inspct'; did you mean inspect?"),
+        (["compare", "a", "b"], "there is no command 'compare'; did you mean eval?"),
+        (["run", "a", "--left", "/cam0"], "did you mean --topics left=/TOPIC?"),
+        (["run", "a", "--gt", "b"], "did you mean --reference?"),
         (["zzz"], "there is no command 'zzz'; vio --help lists them"),
         (["run", "x", "--refrence", "y"], "arguments: --refrence y; did you mean --reference?"),
         (["run", "x", "--frontnd=orb"], "arguments: --frontnd=orb; did you mean --frontend?"),
