@@ -378,6 +378,13 @@ def test_matrices_are_known_by_their_sides(names: tuple[str, ...], tmp_path: Pat
     np.testing.assert_allclose(rig.right[0].coefficients, truth.right[0].coefficients)
 
 
+def test_a_report_of_kalibr_is_no_calibration(tmp_path: Path) -> None:
+    file = tmp_path / "camera-results-cam.txt"
+    file.write_text("Calibration results \n====================\nCamera-system parameters:\n")
+    with pytest.raises(CalibrationError, match="is Kalibr's report in words; give the camchain-"):
+        vio.load_rig(file, image_size=SIZE)
+
+
 def test_cameras_without_the_pose_of_the_right_one_are_refused(tmp_path: Path) -> None:
     matrices = _matrices(forms.true_rig())
     np.savez(tmp_path / "intrinsics.npz", **{n: m for n, m in matrices.items() if n not in "RT"})

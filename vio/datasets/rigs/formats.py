@@ -76,6 +76,7 @@ _OTHERS = (
     ".npz",
     edex.SUFFIX,
 )  # whose content decides in any folder
+_REPORT_BYTES = 100  # of a text, which show what it is
 _MAX_OTHERS = 40  # files looked into; a folder with more is no recording's
 # whether entries are of a format, and what reads it; the first that fits does
 _FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] = (
@@ -221,7 +222,20 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
     raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
 
 
+def _is_report(path: Path) -> bool:
+    """Return whether a text is what Kalibr writes for people."""
+    try:
+        with path.open("rb") as file:
+            return file.read(_REPORT_BYTES).lstrip().startswith(b"Calibration results")
+    except OSError:  # which its reader reports
+        return False
+
+
 def _read_txt(path: Path, image_size: Size | None) -> Rig:
+    if _is_report(path):
+        raise CalibrationError(
+            f"{path}: is Kalibr's report in words; give the camchain-….yaml that it wrote beside it"
+        )
     if bare.is_bare(path):
         return bare.read_bare(path, image_size)
     rig = read_middlebury(path, image_size)
