@@ -374,10 +374,16 @@ def _number_hint(value: Any, hint: Any) -> str:
     return ""
 
 
+# First entries of calibrations, which are given as settings by mistake.
+_OF_CALIBRATIONS = ("cam0", "cam1", "M1", "K1", "camera_matrix", "image_width", "File.version")
+
+
 def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
     """Suggest what to write for an unknown setting."""
     if key in _FIXED.get(prefix[:-1], "").split():
         return "; it is fixed since 0.3: remove it"
+    if not prefix and key in _OF_CALIBRATIONS:
+        return "; this is a calibration: give it with --calibration"
     if "." in key and prefix + key in (row.key for row in describe(root)):
         *parts, last = key.split(".")
         return f"; write it nested, as {': {'.join(parts)}: {{{last}: …{'}' * len(parts)}"

@@ -96,6 +96,15 @@ def test_images_that_are_undistorted_already_are_named() -> None:
     assert "the images are undistorted already" in _said(rig, _raw(plain))
 
 
+@pytest.mark.parametrize("shift_px", [0, 40], ids=["one centre", "two centres"])
+def test_images_that_are_rectified_already_are_named(shift_px: float) -> None:
+    rig = _pair()
+    z = _matches(rig, _raw(rig))
+    words = "the images are rectified already"
+    assert words in _said(rig, (z[:, :2], z[:, 2:] + [shift_px, 0]))
+    assert words not in _said(rig, (z[:, :2], z[:, 2:] + [0, 3]))  # or cut in another place
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -24,6 +24,7 @@ from vio.config import BASIC, Config, describe
 from vio.errors import NOTE, DataError
 from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import se3_inverse
+from vio.mapping.map_database import APPLICATION_ID, BEGIN
 from vio.mavlink.link import open_link
 
 FRAMES = 24
@@ -398,6 +399,15 @@ def test_errors_are_one_line_and_write_nothing(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.parametrize("command", [("export", "colmap"), ("mesh",), ("report",)])
+def test_a_map_in_the_place_of_a_run_is_called_so(
+    command: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "yard.map"
+    file.write_bytes(BEGIN.ljust(68, b"\0") + APPLICATION_ID.to_bytes(4, "big"))
+    assert "is a map, not a run; give the folder" in refused(capsys, *command, file)
+
+
 def test_reports_and_skips_truncated_images_up_to_a_limit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -530,6 +540,9 @@ def test_an_unknown_option_shows_the_usage_of_its_command(
     ("argv", "hint"),
     [
         (["inspct", "x"], "there is no command 'inspct'; did you mean inspect?"),
+        (["compare", "a", "b"], "there is no command 'compare'; did you mean eval?"),
+        (["run", "a", "--left", "/cam0"], "did you mean --topics left=/TOPIC?"),
+        (["run", "a", "--gt", "b"], "did you mean --reference?"),
         (["zzz"], "there is no command 'zzz'; vio --help lists them"),
         (["run", "x", "--refrence", "y"], "arguments: --refrence y; did you mean --reference?"),
         (["run", "x", "--frontnd=orb"], "arguments: --frontnd=orb; did you mean --frontend?"),

@@ -333,6 +333,7 @@ def test_features_of_another_program_are_written_and_read(tmp_path: Path) -> Non
         ),
         ([5, 38, 71], [([1], [[1, 2, 0, 2]], None)] * 3, "frames come 33 ns apart"),  # ms
         ([0], [([1], [[1, 2, 0]], None)], "frame 0"),
+        ([0], [{"ids": [1], "z": [[1, 2, 0, 2]]}], r"of the type dict; give \(ids, z, has_right\)"),
     ],
 )
 def test_malformed_features_are_not_written(
@@ -341,6 +342,17 @@ def test_malformed_features_are_not_written(
     with pytest.raises(DataError, match=message):
         vio.write_observations(tmp_path / "a.npz", CAMERA, times, frames)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_features_without_a_camera_are_not_written(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="camera is of the type ndarray; give a Rig"):
+        vio.write_observations(tmp_path / "a.npz", np.eye(3), [0], [([1], [[1, 2, 0, 2]], None)])
+
+
+def test_features_may_come_from_a_generator(tmp_path: Path) -> None:
+    frames = ([1, 2], [[9, 2, 7, 2], [5, 6, 4, 6]], None), ([1], [[9.5, 2, 7, 2]], None)
+    vio.write_observations(tmp_path / "a.npz", CAMERA, [0, 10**8], (frame for frame in frames))
+    assert len(open_dataset(tmp_path / "a.npz").observations(1)) == 1
 
 
 def test_the_tutorial_describes_every_array() -> None:

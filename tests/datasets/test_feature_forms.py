@@ -199,6 +199,11 @@ def test_the_pixels_of_images_of_another_size_are_doubted(tmp_path: Path) -> Non
         recording = open_dataset(make_npz(tmp_path / "features.npz", changed)).recording
         assert len(recording.doubts) == 1
         assert re.search(words, recording.doubts[0])
+    z = cases["upper left quarter"]["z"]
+    rows = zip(arrays["offsets"], arrays["offsets"][1:], strict=False)
+    frames = [(arrays["ids"][a:b], z[a:b], arrays["has_right"][a:b]) for a, b in rows]
+    vio.write_observations(tmp_path / "w.npz", CAMERA, arrays["frame_times_ns"], frames)
+    assert "upper left quarter" in open_dataset(tmp_path / "w.npz").recording.doubts[0]
 
 
 def test_the_left_pixel_itself_is_no_right_one(tmp_path: Path) -> None:

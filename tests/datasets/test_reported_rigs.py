@@ -355,6 +355,43 @@ def test_arrays_of_numpy_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(rig.cam0.coefficients, truth.cam0.coefficients)
 
 
+_NAMES_OF_SIDES = [
+    ("cameraMatrixLeft", "cameraMatrixRight", "distCoeffsLeft", "distCoeffsRight"),
+    ("left_mtx", "right_mtx", "left_dist", "right_dist"),
+    ("K_l", "K_r", "D_l", "D_r"),
+    ("Camera_Matrix_1", "Camera_Matrix_2", "Dist_Coefs_1", "Dist_Coefs_2"),
+    ("K0", "K1", "D0", "D1"),  # of which K1 and D1 are the left camera's elsewhere
+    ("cameraMatrix0", "cameraMatrix1", "distCoeffs0", "distCoeffs1"),
+]
+
+
+@pytest.mark.parametrize("names", _NAMES_OF_SIDES, ids=lambda names: names[0])
+def test_matrices_are_known_by_their_sides(names: tuple[str, ...], tmp_path: Path) -> None:
+    truth = forms.true_rig()
+    found = _matrices(truth)
+    named = dict(zip(names, (found[n] for n in ("mtxL", "mtxR", "distL", "distR")), strict=True))
+    maps = np.zeros((SIZE[1], SIZE[0], 2))  # of pixels, as are kept with a calibration
+    np.savez(tmp_path / "any.npz", **named, rot=found["R"], trans=found["T"], maps=maps)
+    rig = vio.load_rig(tmp_path, image_size=SIZE)
+    assert rig.cam0.K.tolist() == truth.cam0.K.tolist()
+    assert rig.right[0].K.tolist() == truth.right[0].K.tolist()
+    np.testing.assert_allclose(rig.right[0].coefficients, truth.right[0].coefficients)
+
+
+def test_a_report_of_kalibr_is_no_calibration(tmp_path: Path) -> None:
+    file = tmp_path / "camera-results-cam.txt"
+    file.write_text("Calibration results \n====================\nCamera-system parameters:\n")
+    with pytest.raises(CalibrationError, match="is Kalibr's report in words; give the camchain-"):
+        vio.load_rig(file, image_size=SIZE)
+
+
+def test_cameras_without_the_pose_of_the_right_one_are_refused(tmp_path: Path) -> None:
+    matrices = _matrices(forms.true_rig())
+    np.savez(tmp_path / "intrinsics.npz", **{n: m for n, m in matrices.items() if n not in "RT"})
+    with pytest.raises(CalibrationError, match="has no R and no T, the pose of the right camera"):
+        vio.load_rig(tmp_path / "intrinsics.npz", image_size=SIZE)
+
+
 def test_archives_without_plain_arrays_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "stereo.npz"
     np.savez(file, mtxL=np.array([{"a": 1}], dtype=object))

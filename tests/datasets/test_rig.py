@@ -651,6 +651,22 @@ def test_pairs_of_ros_files_by_other_names(names: tuple[str, str], tmp_path: Pat
         np.testing.assert_allclose(vio.load_rig(path).right[1], T_CAM1_CAM0, atol=1e-9)
 
 
+def test_projections_with_centres_of_their_own_are_those_of_two_pinholes(tmp_path: Path) -> None:
+    """As stereoRectify gives them without CALIB_ZERO_DISPARITY."""
+    P0 = np.array([[40.0, 0, 32, 0], [0, 40, 24, 0], [0, 0, 1, 0]])
+    P1 = np.array([[40.0, 0, 35, -8], [0, 40, 24, 0], [0, 0, 1, 0]])
+    rig = vio.load_rig(write_storage(tmp_path / "p.yml", {"P1": P0, "P2": P1}, (64, 48)))
+    point = np.array([1.0, 0.5, 8.0, 1.0])
+    for camera, in_camera, P in zip(
+        rig.cameras, (point, rig.right[1] @ point), (P0, P1), strict=True
+    ):
+        shown = P @ point
+        np.testing.assert_allclose(project_point(camera, in_camera[:3])[0], shown[:2] / shown[2])
+    P1[1, 2] = 26.0
+    with pytest.raises(CalibrationError, match="differ in focal length or in cy"):
+        vio.load_rig(write_storage(tmp_path / "q.yml", {"P1": P0, "P2": P1}, (64, 48)))
+
+
 def test_vertical_pairs_are_called_that(tmp_path: Path) -> None:
     down = replace(RIG, T_cam1_cam0=se3_from_parts(np.eye(3), [0.001, -0.2, 0.0]))
     with pytest.raises(CalibrationError, match=r"a vertical pair: the cameras are 0\.2 m apart"):
@@ -788,7 +804,7 @@ BAD = {
         _text("notes.txt", "fx=458 b=0.11\n"),
         "and KITTI's calib.txt has one; give that file",
     ),
-    "OpenCV without T": (_storage(T=None, R2=None), "has no entry R2"),
+    "OpenCV without T": (_storage(T=None, R2=None), "has no T, the pose of the right camera"),
     "OpenCV with a rotation vector": (_storage(R=np.zeros((3, 1))), "R holds 3 numbers"),
     "OpenCV of larger images": (
         _storage(M2=np.array([[400.0, 0, 70], [0, 400, 24], [0, 0, 1]])),

@@ -272,13 +272,17 @@ def test_binary_files_of_poses_are_named(data: bytes, kind: str, tmp_path: Path)
         read_trajectory(tmp_path / "poses.txt")
 
 
-def test_seconds_and_nanoseconds_in_two_columns(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "names",
+    ["#sec,nsec", "sec,nanosec", "header.stamp.secs,header.stamp.nsecs", "Seconds,Nanoseconds"],
+)
+def test_seconds_and_nanoseconds_in_two_columns(names: str, tmp_path: Path) -> None:
     whole = [str(t // 10**9) for t in TIMES_NS.tolist()]
     rows = [
         ",".join([s, str(t % 10**9), *map(repr, map(float, [*p, *q]))])
         for s, t, p, q in zip(whole, TIMES_NS.tolist(), P, Q, strict=True)
     ]
-    (tmp_path / "poses.csv").write_text("#sec,nsec,x,y,z,qx,qy,qz,qw\n" + "\n".join(rows) + "\n")
+    (tmp_path / "poses.csv").write_text(f"{names},x,y,z,qx,qy,qz,qw\n" + "\n".join(rows) + "\n")
     found = read_trajectory(tmp_path / "poses.csv")
     np.testing.assert_array_equal(found.times_ns, TIMES_NS)
     np.testing.assert_allclose(found.T_world_body, TRUTH.T_world_body, atol=1e-12)
@@ -516,6 +520,21 @@ def test_poses_that_a_camera_system_lost_and_rows_written_twice_are_left_out(
     file.write_text("\n".join(rows) + "\n")
     with pytest.raises(DataError, match="line 4: a pose is not finite"):
         read_trajectory(file)
+
+
+@pytest.mark.parametrize(
+    ("shift", "words"),
+    [
+        (0, "it was written twice; keep one of both parts"),
+        (-7, "as of two recordings in one file"),
+        (7, "remove or reorder that entry"),  # a step back
+    ],
+)
+def test_times_that_begin_again_are_named(shift: int, words: str) -> None:
+    once = 10**9 * np.arange(1, 21)
+    times = np.concatenate([once, once + shift * 10**8])
+    with pytest.raises(DataError, match=rf"entry 20: the clock runs backwards .*{words}"):
+        check_increasing(times, lambda k: f"entry {k}")
 
 
 @pytest.mark.parametrize(

@@ -661,6 +661,8 @@ def test_odometry_of_a_pair_refuses_one_image() -> None:
     odometry = vio.Odometry(Rig.rectified(300.0, 300.0, 239.5, 149.5, 0.2, 480, 300))
     with pytest.raises(DataError, match="one image came, but this rig takes two"):
         odometry.add_images(0, _walls()[0][0])
+    with pytest.raises(DataError, match=r"the left image is None, as OpenCV's imread"):
+        odometry.add_stereo(0, None, None)
 
 
 def test_odometry_of_one_camera_waits_for_the_scale() -> None:

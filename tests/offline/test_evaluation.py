@@ -675,6 +675,18 @@ def test_time_association_respects_the_limit() -> None:
     assert evaluate(late, timed(T), max_time_difference_s=0.015).matched == 10
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("milliseconds", 10**3), ("microseconds", 10**6)])
+def test_error_names_the_unit_in_which_the_reference_covers_the_estimate(
+    unit: str, factor: int
+) -> None:
+    T = wander(40)
+    estimate = timed(T, start_ns=300_000_000)
+    truth = timed(T)
+    wrong = replace(truth, times_ns=truth.times_ns * factor + 7 * factor)
+    with pytest.raises(EvaluationError, match=f"are {unit}, .* divide them by {factor}$"):
+        evaluate(estimate, wrong)
+
+
 def test_error_reports_different_clocks() -> None:
     T = wander(10)
     with pytest.raises(

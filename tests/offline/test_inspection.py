@@ -211,6 +211,15 @@ def test_one_screen_for_people(flight: Path, capsys: pytest.CaptureFixture[str])
     ]
 
 
+def test_the_next_command_reads_what_was_examined(
+    flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--camera", "left", "--set", "imu.gravity_mps2=9.8"]
+    assert main(["inspect", str(flight), "--pairs", "1", "--frames", "0", *options]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.split()[1:] == ["vio", "run", str(flight), *options]
+
+
 def _imu(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
     def mend(folder: Path) -> None:
         file = folder / "mav0" / "imu0" / "data.csv"

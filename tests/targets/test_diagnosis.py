@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,9 +17,10 @@ from vio.geometry.lie import se3_from_parts, so3_exp
 from vio.records import Image
 from vio.targets.calibrate import calibrate_cameras
 from vio.targets.description import Target, target_text
-from vio.targets.diagnosis import diagnose
+from vio.targets.diagnosis import diagnose, shown_twice
 from vio.targets.recording import Filmed
 from vio.targets.rendering import BoardRenderer, Exposure
+from vio.targets.seeds import checkerboard_seeds
 
 CHARUCO = Target("charuco", 6, 8, 0.05, 0.7, "DICT_4X4_50")
 CHECKERBOARD = Target("checkerboard", 6, 9, 0.05)
@@ -45,8 +47,10 @@ def images() -> dict[str, Image]:
         (replace(CHARUCO, legacy=True), "legacyPattern: false"),
         (replace(CHARUCO, dictionary="DICT_5X5_100"), "markers of DICT_4X4_1000"),
         (replace(CHECKERBOARD, cols=8), "checkerboard of 6 x 9 squares"),
+        # The larger board holds this one twice.
+        (replace(CHECKERBOARD, rows=5, cols=4), "6 x 9 squares (5 x 8 inner corners)"),
     ],
-    ids=["columns", "spacing", "charuco columns", "legacy", "dictionary", "checkerboard"],
+    ids=["columns", "spacing", "charuco columns", "legacy", "dictionary", "checkerboard", "half"],
 )
 def test_names_another_board_than_the_files(
     described: Target, words: str, images: dict[str, Image]
@@ -55,6 +59,14 @@ def test_names_another_board_than_the_files(
     assert reason is not None
     assert words in reason
     assert "\n" not in reason
+
+
+def test_sees_no_board_in_corners_of_anything() -> None:
+    noise = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (480, 640)), (0, 0), 4)
+    image = (255 * (noise - noise.min()) / np.ptp(noise)).astype(np.uint8)
+    few = replace(CHECKERBOARD, rows=6, cols=4)
+    assert len(checkerboard_seeds(image, few)[1])  # by OpenCV
+    assert shown_twice([image], few) is None
 
 
 @pytest.mark.parametrize("shown", [SMALL, CHECKERBOARD], ids=lambda target: target.kind)

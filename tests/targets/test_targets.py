@@ -59,6 +59,7 @@ from vio.targets.rendering import BoardRenderer, Exposure, board_points
 from vio.targets.results import basalt_text
 from vio.targets.start import one_camera, pair_start, poses_of
 from vio.targets.verdict import (
+    depth_sigma,
     depths,
     judge,
     projection_sigma,
@@ -492,6 +493,14 @@ def test_halves_that_agree_inflate_nothing() -> None:
         assert verdict.inflation == 1
         ratios.append(verdict.halves.ratio)
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1, abs=0.2)
+
+
+def test_depth_has_a_sigma_where_views_leave_a_focal_length_free() -> None:
+    """It is that of the linear problem, whose steps must not pass a focal length of zero."""
+    found, _ = _pair(40, count=12)
+    known = depth_sigma(found)
+    free = depth_sigma(replace(found, covariance=1e10 * found.covariance))
+    np.testing.assert_allclose(free, 1e5 * known, rtol=0.01)
 
 
 def test_chooses_the_lens_by_views_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

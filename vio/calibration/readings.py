@@ -85,8 +85,14 @@ def _raw_pixels(rig: StereoRig, rectified: StereoCamera, z: FloatArray) -> list[
     ]
 
 
-def _rows_px(rig: StereoRig, rectified: StereoCamera, raw: list[FloatArray]) -> float | None:
-    """Return the row differences (rms, px) of raw pixels by a rig; None: they are of no pair."""
+def _rows_px(rig: StereoRig | None, rectified: StereoCamera, raw: list[FloatArray]) -> float | None:
+    """Return the row differences (rms, px) of raw pixels by a rig, or as they are without one; None:
+    they are of no pair.
+    """
+    if rig is None:
+        rows = row_residuals(np.hstack(raw), rectified.width or 1, rectified.height or 1)
+        # Where the centres of rectified images differ, disparities may have any sign.
+        return None if isinstance(rows, NotObservable) else rows.rms_px
     try:
         rotations = rectifying_rotations(rig)[:2]
     except CalibrationError:
@@ -106,9 +112,12 @@ def _same(uv: FloatArray) -> FloatArray:
     return uv
 
 
-def _readings(rig: StereoRig) -> Iterator[tuple[str, StereoRig, _Change]]:
-    """Yield other readings of a rig: in words, the rig, and what it does to raw pixels."""
+def _readings(rig: StereoRig) -> Iterator[tuple[str, StereoRig | None, _Change]]:
+    """Yield other readings of a rig: in words, the rig (None: there is nothing to rectify), and what
+    it does to raw pixels.
+    """
     last = np.array([rig.cam0.width - 1, rig.cam0.height - 1], dtype=np.float64)
+    yield "the images are rectified already", None, _same
     yield "both images are mirrored", rig, lambda uv: uv * [-1, 1] + [last[0], 0]
     yield "both images are upside down", rig, lambda uv: last - uv
     yield "both images are flipped, top to bottom", rig, lambda uv: uv * [1, -1] + [0, last[1]]

@@ -22,7 +22,7 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from importlib import import_module
 from types import FrameType, ModuleType
@@ -52,6 +52,23 @@ BY_PURPOSE = {
     "Check without ground truth": ("check", "refine"),
     "Measure": ("bench", "render", "reproduce"),
     "Shell": ("completion",),
+}
+# What is typed in the place of a command or an option, and would be taken for one spelt alike.
+_MEANT = {
+    **dict.fromkeys(("compare", "diff", "ape", "rpe", "ate", "traj"), "eval"),
+    **dict.fromkeys(("plot", "html"), "report"),
+    **dict.fromkeys(("show", "viz", "visualize", "visualise"), "view"),
+    **dict.fromkeys(("slam", "odometry", "odom", "track", "process"), "run"),
+    **dict.fromkeys(("info", "doctor", "validate"), "inspect"),
+    **dict.fromkeys(("simulate", "sim"), "render"),
+    **dict.fromkeys(("camera", "stream"), "live"),
+    **dict.fromkeys(("gnss", "gps"), "georeference"),
+}
+_MEANT_OPTIONS = {
+    **{f"--{role}": f"--topics {role}=/TOPIC" for role in ("left", "right", "imu")},
+    **dict.fromkeys(("--gt", "--groundtruth", "--ground-truth", "--truth"), "--reference"),
+    **dict.fromkeys(("--loop-closure", "--loops", "--slam"), "--map FILE"),
+    **dict.fromkeys(("--mono", "--one-camera"), "--camera left"),
 }
 _FILES = {"eval": "evaluate", "calibrate-rig": "calibrate_rig", "imu-noise": "imu_noise"}
 COMMANDS = tuple(name for names in BY_PURPOSE.values() for name in names)
@@ -144,7 +161,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     else:
         parser = build_parser()
     if command is not None and command not in COMMANDS:
-        parser.error(f"there is no command {command!r}{_near(command, COMMANDS) or _SEE_HELP}")
+        parser.error(
+            f"there is no command {command!r}{_near(command, COMMANDS, _MEANT) or _SEE_HELP}"
+        )
     args, unknown = parser.parse_known_args(words)
     if unknown:
         chosen = next(
@@ -153,15 +172,21 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         first = unknown[0].partition("=")[0]
         hint = ""
         if first.startswith("-"):
-            hint = _near(first, chosen._option_string_actions)
+            hint = _near(first, chosen._option_string_actions, _MEANT_OPTIONS)
         chosen.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     args.command_line = shlex.join(["vio", *words])
     return args
 
 
-def _near(word: str, known: Iterable[str]) -> str:
-    """Return a hint at the known word that is most like another one; nothing where none is."""
-    near = difflib.get_close_matches(word, list(known), 1)
+def _near(word: str, known: Iterable[str], meant: Mapping[str, str]) -> str:
+    """Return a hint at the known word that another one means, or is most like; nothing where none
+    is.
+    """
+    names = list(known)
+    instead = meant.get(word)
+    if instead is not None and instead.split()[0] in names:
+        return f"; did you mean {instead}?"
+    near = difflib.get_close_matches(word, names, 1)
     return f"; did you mean {near[0]}?" if near else ""
 
 

@@ -77,6 +77,18 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def config_words(args: argparse.Namespace) -> list[str]:
+    """Return the arguments that changed the configuration, as another command takes them."""
+    words: list[str] = []
+    for name in ("config", "motion", "backend", "calibration", "camera", "topics", "frontend"):
+        value = getattr(args, name)
+        if value is not None:
+            words += [f"--{name}", str(value)]
+    for override in args.set:
+        words += ["--set", override]
+    return words
+
+
 def add_span_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the range of frames."""
     parser.add_argument(

@@ -11,6 +11,7 @@ from vio.cli.arguments import (
     add_config_arguments,
     add_span_arguments,
     config_from,
+    config_words,
     examples,
 )
 from vio.cli.output import ProgressBar, print_result
@@ -79,7 +80,8 @@ def execute(args: argparse.Namespace) -> int:
         )
     facts = {"source": str(recording.path), "kind": recording.kind, **_facts(report)}
     title = ("recording", f"{recording.path} (kind {recording.kind})")
-    print_result(facts, [title, *_rows(report, args.source)], as_json=args.json, name_width=20)
+    run = shlex.join(["vio", "run", args.source, *config_words(args)])
+    print_result(facts, [title, *_rows(report, run)], as_json=args.json, name_width=20)
     return 1 if report.faults else 0
 
 
@@ -94,7 +96,7 @@ def _facts(report: Inspection) -> dict[str, Any]:
     }
 
 
-def _rows(report: Inspection, source: str) -> list[tuple[str, str]]:
+def _rows(report: Inspection, run: str) -> list[tuple[str, str]]:
     from vio.records import doubts_among
 
     rows = [(part.name, part.text) for part in report.parts]
@@ -105,4 +107,4 @@ def _rows(report: Inspection, source: str) -> list[tuple[str, str]]:
     if report.faults:
         return rows
     verdict = "can be run; settle the doubt above first" if doubts else "can be run"
-    return [*rows, ("verdict", verdict), ("next", f"vio run {shlex.quote(source)}")]
+    return [*rows, ("verdict", verdict), ("next", run)]

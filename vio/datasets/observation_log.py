@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias, cast, get_args
@@ -201,7 +201,7 @@ def write_observations(
     path: str | Path,
     camera: StereoCamera | Rig,
     frame_times_ns: npt.ArrayLike,
-    frames: Sequence[tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike | None]],
+    frames: Iterable[tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike | None]],
     *,
     motion: Sequence[MotionSample] = (),
     T_cam0_imu: FloatArray | None = None,
@@ -229,6 +229,12 @@ def write_observations(
     if isinstance(camera, Rig):
         T_cam0_imu = camera.T_cam0_imu if T_cam0_imu is None else T_cam0_imu
         camera = camera.camera
+    if not isinstance(camera, StereoCamera):
+        raise DataError(
+            f"camera is of the type {type(camera).__name__}; give a Rig (vio.load_rig, "
+            "vio.Rig.rectified) or a recording's camera"
+        )
+    frames = list(frames)
     times_ns = np.asarray(frame_times_ns)
     if times_ns.ndim != 1 or times_ns.dtype.kind not in "iu" or len(times_ns) != len(frames):
         raise DataError(
@@ -240,7 +246,7 @@ def write_observations(
     samples = as_arrays(motion)
     if fault := FRAME_PACE.fault(times_ns) or SAMPLE_PACE.fault(samples.times_ns):
         raise DataError(fault)
-    seen = [frame_observations(k, int(times_ns[k]), *frame) for k, frame in enumerate(frames)]
+    seen = [_one_frame(k, int(times_ns[k]), frame) for k, frame in enumerate(frames)]
     tracks, note = without_placeholders(feature_tracks(dict(enumerate(seen)), len(seen)))
     if fault := features_fault(camera, tracks):
         raise DataError(f"features: {fault}")
@@ -248,10 +254,21 @@ def write_observations(
     recording = Recording(
         "features", Path(path), camera, T, times_ns, False, samples.kinds, reference
     )
+    notes = (note, features_doubt(camera, tracks))
+    recording = replace(recording, notes=tuple(one for one in notes if one is not None))
     if note is not None:
-        recording = replace(recording, notes=(note,))
         seen = [tracks.at(k, int(times_ns[k])) for k in range(len(seen))]
     write_observation_log(Path(path), recording, seen, samples)
+
+
+def _one_frame(index: int, time_ns: int, frame: object) -> Observations:
+    """Return the features of one frame, given as ids, pixels and, where known, right matches."""
+    if not isinstance(frame, tuple | list) or len(frame) not in {2, 3}:
+        raise DataError(
+            f"frame {index} is of the type {type(frame).__name__}; give (ids, z, has_right), arrays "
+            "of one row a feature"
+        )
+    return frame_observations(index, time_ns, *frame)
 
 
 def is_observation_log(names: Sequence[str]) -> bool:

@@ -16,6 +16,9 @@ from vio.files.epochs import epoch_hint
 from vio.records import NS_PER_S, IntArray, Trajectory
 
 AssociationMode: TypeAlias = Literal["time", "frame"]
+_LONG_STEP_S = 2.0  # between poses of no reference, from which on their unit may be another one
+_SMALLER_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+_COMMON = 0.5  # of the shorter of two spans of time, that both have
 _LONGEST_S = 1e9  # fits integer nanoseconds
 
 
@@ -170,11 +173,35 @@ def _no_common_time(estimate_ns: IntArray, reference_ns: IntArray, limit_s: floa
     ]
     own, other = ((int(t[0]), int(t[-1])) for t in (estimate_ns, reference_ns))
     apart = own[1] < other[0] or other[1] < own[0]
+    hint = epoch_hint(own, other, "the reference") if apart else ""
     return (
         f"no poses within {limit_s:g} s of each other: the estimate covers {spans[0]}, the "
         f"reference {spans[1]}, "
         f"closest pair {nearest.min() / NS_PER_S:.6g} s; check the clocks or allow a larger "
-        f"difference{epoch_hint(own, other, 'the reference') if apart else ''}"
+        f"difference{_unit_hint(estimate_ns, reference_ns) or hint}"
+    )
+
+
+def _unit_hint(estimate_ns: IntArray, reference_ns: IntArray) -> str:
+    """Return in which unit the reference's times would cover the estimate; empty: in none, or their
+    poses are as near to each other as poses are.
+    """
+    if len(reference_ns) < 2 or np.median(np.diff(reference_ns)) < _LONG_STEP_S * NS_PER_S:
+        return ""
+    own = estimate_ns[[0, -1]] / NS_PER_S
+    shares = {}
+    for unit, factor in _SMALLER_UNITS.items():
+        other = reference_ns[[0, -1]] / NS_PER_S / factor
+        common = min(own[1], other[1]) - max(own[0], other[0])
+        shorter, longer = sorted((own[1] - own[0], other[1] - other[0]))
+        if common > _COMMON * shorter:
+            shares[unit] = common / longer
+    if not shares:
+        return ""
+    best = max(shares, key=shares.__getitem__)
+    return (
+        f"; if the reference's times are {best}, they cover the estimate: divide them by "
+        f"{_SMALLER_UNITS[best]:.0f}"
     )
 
 

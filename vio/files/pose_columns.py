@@ -62,6 +62,9 @@ _POSITION_ALONE = re.compile(r"(?:p|t|pos|position|trans|translation|xyz)")
 _QUATERNION_ALONE = re.compile(r"(?:q|quat|quaternion|rot|rotation|att|attitude|orientation)")
 # a component with the names of its frames behind, as tx_world_device
 _OF_FRAMES = re.compile(r"([tpq][xyzw])_[a-z]+_[a-z]+")
+# whole seconds of a stamp, and the rest of it in the next column, as header.stamp.sec has them
+_SECONDS = re.compile(r"(?<!n)(?<!nano)(?<!milli)(?<!micro)(?:secs?|seconds?)$")
+_NANOSECONDS = re.compile(r"(?:n|nano)(?:secs?|seconds?)$")
 _SPELT = re.compile(r"\b(?:w[ ,]*x[ ,]*y[ ,]*z|x[ ,]*y[ ,]*z[ ,]*w)\b", re.IGNORECASE)
 _WORDS = re.compile(r"[A-Za-z_][A-Za-z_0-9.]*")
 
@@ -197,7 +200,7 @@ def _named_columns(cells: Sequence[str], *, w_first: bool) -> PoseColumns | None
     after = stamp + 1
     unit = time_unit(cells[stamp])
     nanoseconds = None
-    if names[stamp] in ("sec", "secs", "seconds") and "nsec" in names[after : after + 1]:
+    if _SECONDS.search(names[stamp]) and any(map(_NANOSECONDS.search, names[after : after + 1])):
         unit = "s"
         nanoseconds = after
     return PoseColumns(

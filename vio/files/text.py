@@ -144,6 +144,7 @@ def seconds_text(time_ns: int) -> str:
 
 # of what a counter holds, between its last and its next stamp
 _NEAR_OVERFLOW = 0.01
+_FEWEST_AGAIN = 10  # times that are those of the beginning
 
 
 def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> IntArray:
@@ -171,10 +172,30 @@ def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> In
             "with too few digits; write all their digits (or the time of each entry, where a batch of "
             "them shares one)"
             if repeated > 1 + _ROUNDED * len(times)
-            else _overflowed(int(times[k - 1] - times[k])) or "remove or reorder that entry"
+            else _overflowed(int(times[k - 1] - times[k]))
+            or _begun_again(times, k)
+            or "remove or reorder that entry"
         )
         raise DataError(f"{where(k)}: the clock {what} ({now} s after {before} s); {remedy}")
     return times
+
+
+def _begun_again(times_ns: IntArray, k: int) -> str | None:
+    """Return the remedy where times (N,) begin anew at entry k; None: they do not."""
+    length = min(k, len(times_ns) - k)
+    if length < _FEWEST_AGAIN:
+        return None
+    if np.array_equal(times_ns[:length], times_ns[k : k + length]):
+        return (
+            "from there on the times are those of the beginning: it was written twice; keep one "
+            "of both parts"
+        )
+    if times_ns[k] <= times_ns[0] and np.all(np.diff(times_ns[k : k + length]) > 0):
+        return (
+            "from there on the times increase from before the beginning, as of two recordings in one "
+            "file: give each its own"
+        )
+    return None
 
 
 def _overflowed(back_ns: int) -> str | None:

@@ -120,8 +120,8 @@ def _no_overlap(
         return InertialFinding(
             "clocks without overlap",
             f"{seen}, no IMU sample among them",
-            "the IMU may begin later, or its stamps count from another epoch or in another unit "
-            "(ns, us, ms, s); give "
+            "the IMU may begin later, its samples may be added later than the frames of their time, "
+            "or its stamps count from another epoch or in another unit (ns, us, ms, s); give "
             "both one clock, or use --motion none",
         )
     seen = f"{seen}, IMU samples from {imu[0]} to {imu[1]} ns, without overlap"

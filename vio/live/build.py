@@ -109,7 +109,7 @@ def refuse_other_types(config: Config, **given: object) -> None:
     """
     wanted = {"rig": "vio.load_rig(path)", "dataset": "vio.open_dataset(path)"}
     for name, value in given.items():
-        if value is None or isinstance(value, (str, os.PathLike, dict)):
+        if value is None or isinstance(value, (str, os.PathLike, dict, list, tuple, np.ndarray)):
             raise TypeError(f"{name}: give what {wanted[name]} returns, not {type(value).__name__}")
     if not isinstance(config, Config):
         raise TypeError(

@@ -123,6 +123,11 @@ class Inputs:
             DataError: a wrong type, shape or size, a time not after the last frame's, or images of
                 another rig's kind.
         """
+        if left is None:
+            raise DataError(
+                "the left image is None, as OpenCV's imread and VideoCapture.read return where "
+                "nothing could be read"
+            )
         given = "stereo" if right is not None else "mono" if depth_m is None else "rgbd"
         if given != self._camera:
             raise DataError(f"{_CAME[given]} came, but this rig takes {_TAKES[self._camera]}")

@@ -230,6 +230,13 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
     """
     path = folder / RunFile.METRICS
     if not path.is_file():
+        from vio.mapping.map_store import is_map
+
+        if is_map(folder):
+            raise DataError(
+                f"{folder}: is a map, not a run; give the folder of a run with it (vio run --map), or "
+                "show the map by vio map show"
+            )
         raise DataError(
             f"{folder}: no run folder (it has no {RunFile.METRICS}); give a folder that `vio run` "
             "wrote"

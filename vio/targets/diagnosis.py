@@ -41,6 +41,7 @@ _MIRRORED_TIMES = 4
 _WHITE = np.uint8(255)
 _MAX_BRIGHT = 0.3  # of the pixels, with the largest value: paper and more
 _TOP_PERCENT = 99
+_MAX_GRID_MISFIT = 0.2  # of a square's side: corners of a board from one homography (median)
 _MIN_TOP = 40.0  # of `_WHITE`: the contrast of a print below it is that of noise
 # Dictionaries of which all smaller ones of a size are the beginning.
 _DICTIONARIES = (
@@ -105,11 +106,14 @@ def shown_twice(images: Sequence[Image], target: Target) -> str | None:
 
 
 def _shows_two_checkerboards(image: Image, target: Target) -> bool:
-    """Return whether another board is found where the first one is covered."""
+    """Return whether another board is found where the first one is covered.
+
+    A larger board shows one with fewer squares at several places.
+    """
     import cv2
 
-    _, uv = checkerboard_seeds(image, target)
-    if not len(uv):
+    uv = _whole_checkerboard(image, target)
+    if uv is None or _is_larger(_checkerboard_size(image), target):
         return False
     middle = uv.mean(axis=0)
     # The outer squares lie beyond the outermost corners.
@@ -117,7 +121,29 @@ def _shows_two_checkerboards(image: Image, target: Target) -> bool:
     hull = cv2.convexHull((middle + grown * (uv - middle)).astype(np.float32))
     covered = image.copy()
     cv2.fillConvexPoly(covered, np.rint(hull).astype(np.int32), float(np.median(image)))
-    return len(checkerboard_seeds(covered, target)[1]) > 0
+    return _whole_checkerboard(covered, target) is not None
+
+
+def _whole_checkerboard(image: Image, target: Target) -> FloatArray | None:
+    """Return the inner corners (N, 2) of a checkerboard where they lie in a plane; None: there is
+    none. In a picture without a board, corners of anything make some grid of few.
+    """
+    board, uv = checkerboard_seeds(image, target)
+    if not len(uv):
+        return None
+    H = homographies(board[None], uv[None])
+    off = np.linalg.norm(mapped(H, board[None])[0] - uv, axis=1)
+    grid = uv.reshape(target.rows - 1, target.cols - 1, 2)
+    side = median(np.linalg.norm(np.diff(grid, axis=1), axis=2).ravel())
+    return uv if median(off) < _MAX_GRID_MISFIT * side else None
+
+
+def _is_larger(size: tuple[int, int] | None, target: Target) -> bool:
+    """Return whether a checkerboard has more squares along one side than the target."""
+    if size is None:
+        return False
+    short, long = sorted(size)
+    return short > min(target.rows, target.cols) or long > max(target.rows, target.cols)
 
 
 def _darkness(images: Sequence[Image]) -> str | None:
@@ -280,21 +306,30 @@ def _other_kind(images: Sequence[Image], target: Target, *, is_seen: bool) -> st
 
 def _checkerboard_in(images: Sequence[Image], target: Target) -> str | None:
     """Return a checkerboard in the images that is not the target."""
+    for image in images:
+        size = _checkerboard_size(image)
+        if size is None:
+            continue
+        is_own = target.kind == "checkerboard" and sorted(size) == sorted(
+            (target.cols, target.rows)
+        )
+        if is_own:
+            return None
+        corners = f"{size[0] - 1} x {size[1] - 1} inner corners"
+        return f"a checkerboard of {size[0]} x {size[1]} squares ({corners})"
+    return None
+
+
+def _checkerboard_size(image: Image) -> tuple[int, int] | None:
+    """Return the squares, columns and rows, of the largest checkerboard in an image."""
     import cv2
 
-    for image in images:
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
-        done, _, meta = cv2.findChessboardCornersSBWithMeta(image, (4, 4), flags)
-        if done and meta is not None:
-            rows, cols = meta.shape[:2]
-            size = (cols + 1, rows + 1)
-            is_own = target.kind == "checkerboard" and sorted(size) == sorted(
-                (target.cols, target.rows)
-            )
-            if is_own:
-                return None
-            return f"a checkerboard of {size[0]} x {size[1]} squares"
-    return None
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+    done, _, meta = cv2.findChessboardCornersSBWithMeta(image, (4, 4), flags)
+    if not done or meta is None:
+        return None
+    rows, cols = meta.shape[:2]
+    return cols + 1, rows + 1
 
 
 def _tags_in(images: Sequence[Image], target: Target) -> str | None:

@@ -54,6 +54,8 @@ class _CheckRules(NamedTuple):
 
     compensated_corners: int = 500  # corners by which a motion of the camera is determined
     step_sigmas: Tolerance[float] = 0.1  # of numerical differences
+    # at most by these: focal lengths and baseline, of themselves; coefficients, radians
+    max_step: Tolerance[float] = 1e-3
     # of halves that agree as stated; further apart, they inflate the sigmas
     chance_probability: float = 0.99
     unsynchronised_ratio: float = 1.5  # residual of the pair over that of the cameras alone
@@ -253,12 +255,27 @@ def depth_sigma(found: Adjusted, depth_m: float = DEPTH_M) -> FloatArray:
     values, vectors = np.linalg.eigh(found.covariance)
     total = np.zeros(int(both.sum()))
     for value, vector in zip(values, vectors.T, strict=True):
-        step = _CHECKS.step_sigmas * np.sqrt(max(value, 0.0)) * vector
-        ahead = depths(_shifted(fit, step), uv0[both], uv1[both])
-        behind = depths(_shifted(fit, -step), uv0[both], uv1[both])
-        total += ((ahead - behind) / (2 * _CHECKS.step_sigmas)) ** 2
+        step = np.sqrt(max(value, 0.0)) * vector
+        share = min(_CHECKS.step_sigmas, _largest_share(fit, step))
+        ahead = depths(_shifted(fit, share * step), uv0[both], uv1[both])
+        behind = depths(_shifted(fit, -share * step), uv0[both], uv1[both])
+        total += ((ahead - behind) / (2 * share)) ** 2
     out[both] = np.sqrt(total)
     return out
+
+
+def _largest_share(fit: RigFit, step: FloatArray) -> float:
+    """Return by which factor a step of the unknowns (S,) is a small one of each; few views leave a
+    focal length free by more than itself, and depths are linear in small steps alone.
+    """
+    layout = layout_of(fit.cameras)
+    parts: list[FloatArray] = []
+    for camera, lens in zip(fit.cameras, layout.lenses, strict=True):
+        parts += [step[lens][:4] / camera.fu, step[lens][4:]]
+    for c, pose in enumerate(layout.poses):
+        shift = step[pose][:3] / np.linalg.norm(fit.T_cam_cam0[c + 1][:3, 3])
+        parts += [shift, step[pose][3:]]
+    return _CHECKS.max_step / max(float(np.abs(np.concatenate(parts)).max()), 1e-12)
 
 
 def compare_halves(found: Adjusted, seen: Sightings) -> Halves:

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from vio.cameras.rig import Rig
-from vio.datasets.common import naming
+from vio.datasets.common import naming, npz_names
 from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
 from vio.datasets.kitti_raw import (
     CAMERAS,
@@ -63,7 +63,7 @@ Size = tuple[int, int]
 
 KNOWN = (
     "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt "
-    "or calib_cam_to_cam.txt, OpenCV's stereo .yml or .xml (M1 D1 M2 D2 R T), ROS's left.yaml and "
+    "or calib_cam_to_cam.txt, OpenCV's stereo .yml, .xml or .npz (M1 D1 M2 D2 R T), ROS's left.yaml and "
     "right.yaml, or BoofCV's stereo.xml; or the settings of ORB-SLAM, stella_vslam, VINS, OKVIS, Kimera or SVO, "
     "Basalt's, Monado's, DepthAI's or Spectacular AI's JSON, cuVSLAM's EDEX, or a ZED's SN*.conf"
 )
@@ -73,8 +73,10 @@ _OTHERS = (
     ".json",
     ".xml",
     ".conf",
+    ".npz",
     edex.SUFFIX,
 )  # whose content decides in any folder
+_REPORT_BYTES = 100  # of a text, which show what it is
 _MAX_OTHERS = 40  # files looked into; a folder with more is no recording's
 # whether entries are of a format, and what reads it; the first that fits does
 _FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] = (
@@ -159,6 +161,8 @@ def _by_content(folder: Path) -> Path | None:
 
 def _is_known(file: Path) -> bool:
     try:
+        if file.suffix.lower() == ".npz":  # whose arrays may be those of a recording
+            return is_opencv(dict.fromkeys(npz_names(file), True))
         entries = _entries(file)
     except DataError:
         return False
@@ -218,7 +222,20 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
     raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
 
 
+def _is_report(path: Path) -> bool:
+    """Return whether a text is what Kalibr writes for people."""
+    try:
+        with path.open("rb") as file:
+            return file.read(_REPORT_BYTES).lstrip().startswith(b"Calibration results")
+    except OSError:  # which its reader reports
+        return False
+
+
 def _read_txt(path: Path, image_size: Size | None) -> Rig:
+    if _is_report(path):
+        raise CalibrationError(
+            f"{path}: is Kalibr's report in words; give the camchain-….yaml that it wrote beside it"
+        )
     if bare.is_bare(path):
         return bare.read_bare(path, image_size)
     rig = read_middlebury(path, image_size)

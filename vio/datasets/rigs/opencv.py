@@ -31,7 +31,7 @@ from vio.datasets.yaml_files import (
 from vio.errors import CalibrationError
 from vio.files.printable import printable
 from vio.geometry.distortion import DistortionModel
-from vio.geometry.lie import FloatArray, checked_transform, so3_exp
+from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, so3_exp
 from vio.geometry.rectify import vertical_fault
 
 _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
@@ -47,14 +47,24 @@ _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
             "rightDistortionCoefficients"),
     "xi0": ("xi1", "xi_1", "xiL", "xi_left"),
     "xi1": ("xi2", "xi_2", "xiR", "xi_right"),
-    "R": ("R", "rotation", "Rot", "R_stereo", "rotation_matrix", "rotationMatrix", "rvec", "om"),
-    "T": ("T", "translation", "Trns", "T_stereo", "translation_vector", "translationVector", "tvec"),
+    "R": ("R", "rotation", "Rot", "R_stereo", "rotation_matrix", "rotationMatrix", "Rotation", "rot",
+            "rvec", "om"),
+    "T": ("T", "translation", "Trns", "T_stereo", "translation_vector", "translationVector",
+            "Translation", "trans", "tvec"),
     "R0": ("R1", "LEFT.R", "RL"),
     "R1": ("R2", "RIGHT.R", "RR"),
     "P0": ("P1", "LEFT.P", "projMatrixL", "PL"),
     "P1": ("P2", "RIGHT.P", "projMatrixR", "PR"),
 }  # fmt: skip
 _LONG_NAME = 6  # letters
+_MOST_NUMBERS = 100  # of a matrix; maps of pixels have more
+# Words for a matrix, and for a camera's side, of which other names consist: in small letters.
+_MATRIX_WORDS = ("cameramatrix", "cammatrix", "cammtx", "intrinsicmatrix", "intrinsics", "intrinsic",
+            "matrix", "mtx", "k", "m")  # fmt: skip
+_DISTORTION_WORDS = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff",
+            "distcoefs", "distcoef", "distortion", "coeffs", "dist", "d")  # fmt: skip
+_SIDES = (("left", "right"), ("l", "r"), ("1", "2"), ("cam1", "cam2"))
+_SIDES_FROM_ZERO = (("0", "1"), ("cam0", "cam1"))
 _ROTATION_VECTORS = ("rvec", "om")  # of `omnidir::stereoCalibrate`
 _SIZES = (
     ("image_width", "image_height"),
@@ -96,12 +106,13 @@ def read_arrays(path: Path) -> dict[str, object]:
     """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name].tolist() for name in arrays.files}
+            read = {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, BadZipFile) as error:
         raise CalibrationError(
             f"{path}: is no archive of NumPy with plain arrays ({printable(str(error))}); save the "
             "matrices of the calibration with numpy.savez"
         ) from error
+    return {name: array.tolist() for name, array in read.items() if array.size <= _MOST_NUMBERS}
 
 
 def rig_from_opencv(entries: Entries, where: str, image_size: tuple[int, int] | None) -> Rig:
@@ -196,6 +207,12 @@ def _stereo_pose(entries: Entries, where: str) -> FloatArray:
                 f"{where}: R must be 3x3 and T hold 3 numbers, not {R.shape} and {T.shape}"
             )
         return checked_transform(np.column_stack([R, T]), f"{where}, R")
+    if _find(entries, "R1") is None:
+        missing = [name for name in ("R", "T") if _find(entries, name) is None]
+        raise CalibrationError(
+            f"{where}: has no {' and no '.join(missing)}, the pose of the right camera; add it, or "
+            "put the file that has it beside this one (extrinsics.yml beside intrinsics.yml)"
+        )
     R0, R1 = (_required(entries, key, (3, 3), where) for key in ("R0", "R1"))
     P = _required(entries, "P1", None, where)[:3, :4]
     return checked_transform(
@@ -207,18 +224,24 @@ def _stereo_pose(entries: Entries, where: str) -> FloatArray:
 def _rectified(entries: Entries, where: str, width: int, height: int) -> Rig:
     P0, P1 = (_required(entries, key, (3, 4), where) for key in ("P0", "P1"))
     with naming(where):
-        if not np.allclose(P0[:, :3], P1[:, :3], rtol=1e-6):
+        if not np.allclose(P0[1:, :3], P1[1:, :3], rtol=1e-6) or P0[0, 0] != P1[0, 0]:
             raise CalibrationError(
-                "P1 and P2 differ in focal length or centre; calibrate with CALIB_ZERO_DISPARITY"
+                "P1 and P2 differ in focal length or in cy, as those of no rectified pair do; give "
+                "those of one call of stereoRectify"
             )
         camera = camera_from_matrix(P0[:, :3], width, height, name="P1")
         shift = np.asarray(np.linalg.solve(P1[:, :3], P1[:, 3] - P0[:, 3]), dtype=np.float64)
         if (fault := vertical_fault(shift)) is not None:
             raise CalibrationError(fault)
         baseline = -float(shift[0])
+        note = f"{where}: holds P1 and P2 only, so the images are taken to be rectified"
+        if P0[0, 2] != P1[0, 2]:  # without CALIB_ZERO_DISPARITY
+            right = camera_from_matrix(P1[:, :3], width, height, name="P2")
+            T_cam1_cam0 = se3_from_parts(np.eye(3), [-baseline, 0.0, 0.0])
+            return Rig(camera, right, T_cam1_cam0, notes=(note,))
         return Rig.rectified(
             camera.fu, camera.fv, camera.cu, camera.cv, baseline, width, height
-        ).noting(f"{where}: holds P1 and P2 only, so the images are taken to be rectified")
+        ).noting(note)
 
 
 def coefficients_of(model: DistortionModel, D: Sequence[float]) -> tuple[float, ...]:
@@ -289,11 +312,32 @@ def _name(entries: Entries, key: str) -> str:
 
     Long names are found in any case; of short ones `k1` is a coefficient and `K1` a matrix.
     """
+    from_zero = _of_side(entries, key, _SIDES_FROM_ZERO)
+    if from_zero is not None:  # `K1` is the right camera's beside `K0`
+        return from_zero
     exact = next((name for name in _NAMES[key] if name in entries), None)
     if exact is not None:
         return exact
     long = {name.lower() for name in _NAMES[key] if len(name) >= _LONG_NAME}
-    return next((name for name in entries if name.lower() in long), _NAMES[key][0])
+    by_case = next((name for name in entries if name.lower() in long), None)
+    return by_case or _of_side(entries, key, _SIDES) or _NAMES[key][0]
+
+
+def _of_side(entries: Entries, key: str, all_sides: tuple[tuple[str, str], ...]) -> str | None:
+    """Return the entry whose name is a word for a camera's matrix, or its distortion, with that of a
+    side before or behind it, where the other side has one alike.
+    """
+    if key not in {"K0", "K1", "D0", "D1"}:
+        return None
+    words = _MATRIX_WORDS if key[0] == "K" else _DISTORTION_WORDS
+    plain = {"".join(filter(str.isalnum, str(name))).lower(): str(name) for name in entries}
+    place = int(key[1])
+    for word in words:
+        for sides in all_sides:
+            for pair in ([word + side for side in sides], [side + word for side in sides]):
+                if all(name in plain for name in pair):
+                    return plain[pair[place]]
+    return None
 
 
 def _required(entries: Entries, key: str, shape: tuple[int, int] | None, where: str) -> FloatArray:
