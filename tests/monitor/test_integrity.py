@@ -323,3 +323,31 @@ def test_a_share_of_the_motion_stays_in_doubt_after_its_finding_has_ended() -> N
     assert sigmas[0] == pytest.approx(0.25 * 0.4, rel=0.01)
     assert sigmas[3:] == pytest.approx(11 * [0.25 * 1.0], rel=0.01)
     assert monitor.take_marks() == (Mark(4, 6, "degraded", "tracks-disagree", share=0.25),)
+
+
+def test_an_event_does_not_doubt_all_motion_since_a_small_share_of_it_was_in_doubt() -> None:
+    """0.2 m a frame: a tenth of 60 frames, all of 3 frames before a second, and that second."""
+    monitor = IntegrityMonitor()
+    judge(monitor, range(1))
+    figures = {"doubted_share": 0.1}
+    monitor.take(Finding("tracks-disagree", "", 1, 0, lasts=True, figures=figures))
+    judge(monitor, range(1, 61))
+    monitor.take(Finding("view-changed", "", 61, 57))
+    judge(monitor, range(61, 62))
+    monitor.take(Finding("tracks-disagree", "", 62, ended=True))
+    after = judge(monitor, range(62, 120))
+    assert after[-1].integrity == "nominal"
+    within_s = sum(e.integrity == "unusable" for e in after)
+    doubted = 0.1 * 61 + 0.9 * 4 + within_s
+    sigma_m = float(np.sqrt(after[-1].covariance[0, 0]))
+    assert sigma_m == pytest.approx(0.2 * doubted, rel=0.01)
+
+
+def test_a_doubt_that_is_said_again_goes_on() -> None:
+    """0.2 m a frame, as an event of the same code follows before the one before it is over."""
+    monitor = IntegrityMonitor()
+    judge(monitor, range(4))
+    for k in range(4, 20, 4):
+        monitor.take(Finding("view-changed", "", k))
+        last = judge(monitor, range(k, k + 4))[-1]
+    assert float(np.sqrt(last.covariance[0, 0])) == pytest.approx(0.2 * 15, rel=0.01)

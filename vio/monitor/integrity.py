@@ -110,8 +110,9 @@ class IntegrityMonitor:
         self._last: tuple[int, FloatArray] | None = None  # time and position of the last frame
         self._speed_mps = _MIN_SPEED_MPS  # the fastest so far
         self._times = _FrameTimes()
-        self._doubted_since_ns: int | None = None
-        self._doubted_share = 0.0  # the largest since then
+        self._doubts: list[Finding] = []  # that the motion up to the last frame is in doubt by
+        # how long it has been, where a share of the motion counts as that share of the time
+        self._doubted_s = 0.0
         self._carried_m = 0.0  # that the position may be off by since earlier faults
         self._doubt_m = 0.0  # the same with the present one
         # innovations over their standard deviations by a motion sensor
@@ -202,8 +203,9 @@ class IntegrityMonitor:
         self._update(index, estimate.time_ns)
         held = [entry.finding for entry in self._holding.values()]
         integrity = worst([finding.effect for finding in held])
+        step_ns = 0 if self._last is None else estimate.time_ns - self._last[0]
         self._measure_speed(estimate, usable=integrity != "unusable")
-        self._measure_doubt(estimate.time_ns, held)
+        self._measure_doubt(estimate.time_ns, step_ns, held)
         self._measure_misled(estimate.covariance)
         unscaled = (
             float(np.linalg.eigvalsh(self._unscaled[1:, 1:])[-1]) if self._unscaled.any() else 0.0
@@ -217,21 +219,28 @@ class IntegrityMonitor:
             covariance = inflated(covariance, doubt_m)
         return replace(estimate, integrity=integrity, findings=codes, covariance=covariance)
 
-    def _measure_doubt(self, now_ns: int, held: list[Finding]) -> None:
-        """Bring what the position may be off by to the present."""
-        doubted = [f for f in held if _doubted_share(f) > 0.0]
-        if not doubted:
-            self._doubted_since_ns = None
-            self._doubted_share = 0.0
+    def _measure_doubt(self, now_ns: int, step_ns: int, held: list[Finding]) -> None:
+        """Bring what the position may be off by to the present, a step after the last frame."""
+        before = self._doubts
+        self._doubts = [f for f in held if _doubted_share(f) > 0.0]
+        if not self._doubts:
+            self._doubted_s = 0.0
             self._carried_m = self._doubt_m
             return
-        if self._doubted_since_ns is None:
-            self._doubted_since_ns = now_ns
-        since = [self._onset_ns(f, now_ns) for f in doubted]
-        self._doubted_since_ns = min(self._doubted_since_ns, *since)
-        self._doubted_share = max(self._doubted_share, *map(_doubted_share, doubted))
-        fastest_m = self._speed_mps * (now_ns - self._doubted_since_ns) / NS_PER_S
-        moved_m = self._doubted_share * fastest_m
+        codes = {f.code for f in self._doubts}
+        goes_on = max((_doubted_share(f) for f in before if f.code in codes), default=0.0)
+        self._doubted_s += goes_on * step_ns / NS_PER_S
+        # what was in doubt before a finding on it counts from there on, and not twice
+        known = max(map(_doubted_share, before), default=0.0)
+        for finding in sorted(self._doubts, key=_doubted_share):
+            if finding in before:
+                continue
+            share = _doubted_share(finding)
+            ago_s = (now_ns - self._onset_ns(finding, now_ns)) / NS_PER_S
+            more_s = max(share - known, 0.0) * ago_s
+            self._doubted_s = max(self._doubted_s + more_s, share * ago_s)
+            known = max(known, share)
+        moved_m = self._speed_mps * self._doubted_s
         self._doubt_m = float(np.hypot(self._carried_m, moved_m))
 
     def _measure_misled(self, covariance: FloatArray) -> None:
