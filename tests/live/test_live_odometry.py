@@ -8,6 +8,7 @@ import gc
 import logging
 import threading
 import weakref
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -404,6 +405,46 @@ def test_results_after_a_reset_are_counted_where_times_begin_anew() -> None:
     monitor.result(5)
     assert monitor.figures(0).results == 4
     assert not monitor._arrived
+
+
+def test_a_time_that_comes_again_is_that_of_the_newest_frame() -> None:
+    """As where one camera found no start before a recording began again."""
+    monitor = LiveMonitor(judges_latency=True)
+    for k in range(4):
+        monitor.arrived(k)
+    monitor._arrived = deque((t, s - 1000.0) for t, s in monitor._arrived)
+    for k in range(4):
+        monitor.arrived(k)
+    for k in range(2, 4):
+        monitor.result(k)
+    worst_ms = monitor.figures(0).latency_worst_ms
+    assert worst_ms is not None
+    assert worst_ms < 1000.0
+    assert not monitor._arrived
+
+
+def test_a_frame_may_arrive_while_a_result_is_noted() -> None:
+    monitor = LiveMonitor(judges_latency=True)
+    threads: list[threading.Thread] = []
+
+    class _Time(int):
+        """A time, beside whose comparison another thread notes a frame."""
+
+        def __eq__(self, other: object) -> bool:
+            threads.append(threading.Thread(target=monitor.arrived, args=(9,)))
+            threads[-1].start()
+            threads[-1].join(0.05)
+            return int(self) == other
+
+        __hash__ = int.__hash__
+
+    for k in range(3):
+        monitor.arrived(k)
+    monitor.result(_Time(1))
+    for thread in threads:
+        thread.join()
+    assert monitor.figures(0).results == 1
+    assert [t for t, _ in monitor._arrived if t != 9] == [2]
 
 
 @pytest.fixture

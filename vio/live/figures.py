@@ -4,6 +4,7 @@ whether that is normal.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from dataclasses import dataclass
@@ -67,6 +68,7 @@ class LiveMonitor:
         self._judges = judges_latency
         # time of the frame, ns, and of its arrival, s
         self._arrived: deque[tuple[int, float]] = deque()
+        self._lock = threading.Lock()  # of these
         self._latencies_s: deque[float] = deque(maxlen=_FIGURES.kept_results)
         self._left_out: deque[bool] = deque(maxlen=100)
         self._late = 0  # results in a row
@@ -76,7 +78,8 @@ class LiveMonitor:
 
     def arrived(self, time_ns: int) -> None:
         """Note a frame before it is put into the queue."""
-        self._arrived.append((time_ns, time.perf_counter()))
+        with self._lock:
+            self._arrived.append((time_ns, time.perf_counter()))
 
     def queued(self, *, fits: bool) -> None:
         """Note whether there was room for a frame; else, one that had waited longer was left
@@ -90,13 +93,10 @@ class LiveMonitor:
         behind.
         """
         now = time.perf_counter()
-        # after a reset, times may begin again below that of a frame that never had a result
-        place = next((k for k, (t, _) in enumerate(self._arrived) if t == time_ns), None)
-        if place is None:
+        arrived_s = self._take_arrival(time_ns)
+        if arrived_s is None:
             return None
-        for _ in range(place):
-            self._arrived.popleft()
-        latency = now - self._arrived.popleft()[1]
+        latency = now - arrived_s
         self.results += 1
         self._latencies_s.append(latency)
         self._worst_s = max(self._worst_s, latency)
@@ -116,6 +116,22 @@ class LiveMonitor:
         if left_out:
             lost = f", {left_out} of the last {len(self._left_out)} frames left out"
         return f"falling behind by {latency:.1f} s{lost}: use --config fast, or set dataset.max_frame_rate"
+
+    def _take_arrival(self, time_ns: int) -> float | None:
+        """Return when the newest frame of a time arrived, and forget it and those before; None: none
+        of this time did.
+
+        After a reset, times may begin again at or below those of frames that never had a result.
+        """
+        with self._lock:
+            last = len(self._arrived) - 1
+            times = reversed(self._arrived)
+            back = next((k for k, (t, _) in enumerate(times) if t == time_ns), None)
+            if back is None:
+                return None
+            for _ in range(last - back):
+                self._arrived.popleft()
+            return self._arrived.popleft()[1]
 
     def figures(self, waiting: int) -> LiveFigures:
         """Return the figures so far, with the number of frames in the queue."""
