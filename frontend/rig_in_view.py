@@ -58,23 +58,29 @@ class _BeforeScene:
     """
 
     def __init__(self) -> None:
-        self._recent = deque[bool](
-            maxlen=_RIG.recent_frames
-        )  # frames in which it moves, or after that
+        # frames in which it moves, or after that, and whether it is such an object's
+        self._recent = deque[tuple[int, bool]](maxlen=_RIG.recent_frames)
+        self.since = 0  # first frame of those in which it stands
         self.stands = False
 
     @property
     def done(self) -> bool:
         """Whether it was the scene's in the first frames."""
         is_full = len(self._recent) == _RIG.recent_frames
-        return is_full and not self.stands and sum(self._recent) < _RIG.frames
+        return is_full and not self.stands and len(self._frames) < _RIG.frames
 
-    def see(self, is_before: bool) -> bool:
+    @property
+    def _frames(self) -> list[int]:
+        return [index for index, is_before in self._recent if is_before]
+
+    def see(self, index: int, is_before: bool) -> bool:
         """Take whether it is in a frame; return whether that begins or ends with it."""
-        self._recent.append(is_before)
-        count = sum(self._recent)
+        self._recent.append((index, is_before))
+        frames = self._frames
         stood = self.stands
-        self.stands = count > 0 if stood else count >= _RIG.frames
+        self.stands = len(frames) > 0 if stood else len(frames) >= _RIG.frames
+        if self.stands and not stood:
+            self.since = frames[0]
         return self.stands != stood
 
 
@@ -132,8 +138,8 @@ class RigInView(Finder):
         if not self._before.done and (moves or self._before.stands):
             behind = ~stays & (flow_px <= problem.limit_px)
             told = moves and measured is None
-            is_before = told and _is_scene(problem, points, stays, behind)
-            if self._before.see(is_before):
+            is_before = told and _is_scene(problem, points, stays, behind, may_be_nearer=False)
+            if self._before.see(index, is_before):
                 self._report_before(index, float(behind.mean()))
         if self._moved >= _RIG.moved_frames:
             return
@@ -167,7 +173,7 @@ class RigInView(Finder):
     def _moves(self, index: int) -> None:
         self._moved += 1
         self._replaced = False
-        if self._reported and self._moved >= _RIG.moved_frames:
+        if self._reported and self._moved >= _RIG.moved_frames and not self._before.stands:
             message = (
                 f"frame {index}: the points that stayed at the same pixels are not used any more"
             )
@@ -175,16 +181,19 @@ class RigInView(Finder):
 
     def _report_before(self, index: int, share: float) -> None:
         if not self._before.stands:
+            if self._reported and self._moved < _RIG.moved_frames:
+                return  # what replaced the view holds
             message = f"frame {index}: no points stay behind those that move any more"
             self._found.append(Finding(_CODE, message, index, ended=True))
             return
         message = (
             f"frame {index}: {100 * share:.0f} % of the points have stayed at the same pixels since "
-            f"frame {self._since}, behind or all over those that are taken for the scene: these may be "
+            f"frame {self._before.since}, behind or all over those that are taken for the scene: these may be "
             "of something that moves before a rig that stands still"
         )
         figures = {"scene_share": share}
-        self._found.append(Finding(_CODE, message, index, self._since, lasts=True, figures=figures))
+        since = self._before.since
+        self._found.append(Finding(_CODE, message, index, since, lasts=True, figures=figures))
 
     def _report(self, index: int, share: float) -> None:
         self._reported = True
@@ -210,10 +219,15 @@ def _flow_px(camera: StereoCamera, points: MovedPoints, chosen: BoolArray) -> fl
 
 
 def _is_scene(
-    problem: RansacProblem, points: MovedPoints, consensus: BoolArray, scene: BoolArray
+    problem: RansacProblem,
+    points: MovedPoints,
+    consensus: BoolArray,
+    scene: BoolArray,
+    *,
+    may_be_nearer: bool = True,
 ) -> bool:
     """Whether points (N,) of the `scene` follow one motion, behind those of the consensus and as wide
-    or high, or all over them.
+    or high, or all over them; `may_be_nearer`: then at any depth, else not before them.
     """
     count = int(scene.sum())
     if count < max(_RIG.min_points, _RIG.min_share * len(scene)):
@@ -222,6 +236,9 @@ def _is_scene(
     is_behind = median(depth[consensus]) <= _RIG.nearer * median(depth[scene])
     apart_px = points.pixels[scene].std(axis=0)
     is_wide = apart_px >= _RIG.spread * points.pixels[consensus].std(axis=0)
+    is_nearer = median(depth[scene]) <= _RIG.nearer * median(depth[consensus])
+    if is_nearer and not may_be_nearer:
+        return False
     if not (is_wide.any() if is_behind else is_wide.all()):
         return False
     _, follows = best_motion(problem, points.p_prev[scene], points.pixels[scene], _STILL[None])

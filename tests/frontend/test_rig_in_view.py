@@ -203,6 +203,46 @@ def test_what_stays_behind_a_rig_that_moved_first_is_no_scene() -> None:
     assert _object_before(range(15, 40), check) == []
 
 
+def test_an_object_that_comes_after_a_long_standstill_holds_from_its_own_first_frame_on() -> None:
+    check = RigInView()
+    for k in range(1, 50):
+        assert not _see(check, k, scene(200, k, FAR), NONE, (REST, REST))
+    found = []
+    for k in range(50, 70):
+        points = scene(200, k, CLOSE), scene(30, 100 + k, FAR)
+        found += _see(check, k, *points, (ASIDE, REST))
+    assert [(f.frame, f.since, f.ended) for f in found] == [(54, 50, False)]
+
+
+def test_what_is_found_of_an_object_outlasts_what_was_found_at_standstill() -> None:
+    """It grows over the view, and is the consensus from frame 10 on."""
+    check = RigInView()
+    found = []
+    for k in range(1, 30):
+        motions = (REST, STEP) if k < 10 else (ASIDE, REST)
+        found += _see(check, k, scene(200, k, CLOSE), scene(40, 100 + k, FAR), motions)
+    assert [(f.frame, f.since, f.ended) for f in found] == [(5, 1, False), (14, 10, False)]
+
+
+def test_a_view_that_is_replaced_beside_an_object_is_named_until_it_moves() -> None:
+    check = RigInView()
+    _object_before(range(1, 20), check)
+    check.replace(20, CAMERA)
+    found = []
+    for k in range(20, 60):
+        found += _see(check, k, scene(200, k, FAR), NONE, (REST, REST))
+    assert [(f.frame, f.since, f.ended) for f in found] == [(24, 20, False)]
+
+
+def test_parts_of_the_rig_all_around_a_scene_that_moves_are_no_scene() -> None:
+    """As a cabin around a camera: nearer than what moves."""
+    for motion in (STEP, ASIDE):
+        check = RigInView()
+        for k in range(1, 30):
+            near = scene(40, 100 + k, (0.6, 0.9))
+            assert not _see(check, k, scene(200, k, FAR), near, (motion, REST))
+
+
 def _replaced(
     before: FloatArray,
     after: FloatArray,
