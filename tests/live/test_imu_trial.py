@@ -15,9 +15,11 @@ import pytest
 
 from tests.monitor.test_inertial_check import Watched, _recording
 from vio import evaluate, load_config, run
+from vio.errors import DivergedError
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import so3_exp
 from vio.imu.findings import ImuVerdict, InertialFinding
+from vio.live.imu_trial import ImuTrial
 from vio.live.odometry import Odometry
 from vio.records import (
     Estimate,
@@ -28,6 +30,7 @@ from vio.records import (
     Recording,
     StereoFrame,
     Trajectory,
+    UpdateReport,
 )
 from vio.runs.pipeline import RunControl, RunResult
 from vio.runs.recorder import GrowingFolder
@@ -351,8 +354,9 @@ def test_images_alone_go_on_where_a_clock_has_jumped(
     flight, alone = long_flight
     result = _run(_with_clock(flight, 80.0, 0.25))
     assert _worst_m(result.trajectory, alone) < 0.03
-    (finding,) = [f for f in result.findings if f.code == "estimate-implausible"]
-    assert "a clock has jumped" in finding.message
+    found, end = [f for f in result.findings if f.code == "estimate-implausible"]
+    assert "a clock has jumped" in found.message
+    assert end.ended
 
 
 def test_a_clock_that_has_jumped_after_the_first_minute_ends_in_a_new_start(
@@ -417,3 +421,27 @@ def test_images_carry_on_by_the_depths_of_before_when_the_right_camera_fails(
         _run(_Features(replace(it, frames=frames), [], recording), "none").frames.column("used")
     )
     assert used[40:].min() > 10
+
+
+class _Diverges:
+    """A back end that diverges in its second frame."""
+
+    def update(self, seen: Observations) -> UpdateReport:
+        if seen.frame_index == 1:
+            raise DivergedError("frame 1: lost")
+        return self.restart(seen)
+
+    def restart(self, seen: Observations) -> UpdateReport:
+        return UpdateReport(0, 0, 0, 0, None, None, np.zeros(0, dtype=np.int64))
+
+    def estimate(self) -> Estimate:
+        return Estimate(0, np.eye(4), np.eye(6))
+
+
+def test_frames_that_a_back_end_is_started_again_in_are_known() -> None:
+    trial = ImuTrial(_Diverges())  # type: ignore[arg-type]
+    for seen in _recording("room").frames[:3]:
+        trial.take(seen)
+    again = trial.again(ImuVerdict(usable=False))
+    assert again is not None
+    assert [frame.restarted for frame in again[1]] == ["", "frame 1: lost", ""]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,13 @@ from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import ImuVerdict
 from vio.monitor.run import RunMonitor
 from vio.monitor.update_checks import UpdatedFrame
-from vio.records import Estimate, Observations, UpdateReport, observations
+from vio.records import (
+    Estimate,
+    Observations,
+    StereoScaleEstimate,
+    UpdateReport,
+    observations,
+)
 
 CAMERA = StereoCamera(400, 400, 320, 240, 0.1)
 FRAMES = 60
@@ -89,3 +97,71 @@ def test_left_images_alone_leave_the_scale_uncertain() -> None:
     frames = [_updated(k, speed_mps=1.0, right=k < 5) for k in range(FRAMES)]
     again = monitor.begun_again(FRAMES - 1, ImuVerdict(usable=False), frames)
     assert again[FRAMES - 1].covariance[0, 0] > 4.0 * frames[-1].estimate.covariance[0, 0]
+
+
+def _unseen(k: int) -> UpdatedFrame:
+    """A frame that the back end uses no feature of."""
+    frame = _updated(k)
+    report = UpdateReport(0, 0, 0, 0, None, None, IDS[:0], innovation_ratio=None)
+    return UpdatedFrame(frame.seen, report, frame.estimate)
+
+
+def _given(monitor: RunMonitor, frames: list[UpdatedFrame]) -> None:
+    for frame in frames:
+        assert frame.seen is not None
+        index = frame.seen.frame_index
+        monitor.observations(frame.seen)
+        monitor.update(index, frame.report, frame.estimate)
+        monitor.judged(index, frame.estimate)
+
+
+def test_what_lasts_of_estimates_that_are_replaced_ends_with_them() -> None:
+    """But for what the new ones show, too."""
+    unseen = [_updated(k) if k < 20 else _unseen(k) for k in range(FRAMES)]
+    for again, ended in ((unseen, False), ([_updated(k) for k in range(FRAMES)], True)):
+        monitor = RunMonitor(CAMERA, np.eye(4), imu=True)
+        _given(monitor, unseen)
+        monitor.begun_again(FRAMES, ImuVerdict(usable=False), again)
+        (begun, *ends) = [f for f in monitor.findings if f.code == "no-features"]
+        assert begun.lasts
+        assert [(f.frame, f.ended) for f in ends] == ended * [(FRAMES, True)]
+
+
+def test_a_restart_of_a_back_end_that_takes_all_again_is_reported() -> None:
+    monitor = _monitor(speed_mps=0.0)
+    frames = [_updated(k) for k in range(FRAMES)]
+    frames[40] = replace(frames[40], restarted="frame 40: the filter diverged")
+    again = monitor.begun_again(FRAMES, ImuVerdict(usable=False), frames)
+    (found,) = [f for f in monitor.findings if f.code == "estimate-restarted"]
+    assert found.frame == 40
+    assert "estimate-restarted" in again[40].findings
+
+
+def test_images_alone_contradict_no_imu() -> None:
+    monitor = _monitor(speed_mps=0.0)
+    far = [_updated(k) for k in range(FRAMES)]
+    far = [replace(f, report=replace(f.report, innovation_ratio=6.0)) for f in far]
+    monitor.begun_again(FRAMES, ImuVerdict(usable=False), far)
+    assert "imu-disagrees" not in {f.code for f in monitor.findings}
+    monitor.begun_again(FRAMES, ImuVerdict(), far)
+    assert "imu-disagrees" in {f.code for f in monitor.findings}
+
+
+def test_a_contradiction_ends_where_the_run_goes_on_without_the_imu() -> None:
+    monitor = RunMonitor(CAMERA, np.eye(4), imu=True)
+    far = [_updated(k) for k in range(FRAMES)]
+    _given(monitor, [replace(f, report=replace(f.report, innovation_ratio=6.0)) for f in far])
+    monitor.goes_on_from(FRAMES, ImuVerdict(usable=False))
+    found = [f.ended for f in monitor.findings if f.code == "imu-disagrees"]
+    assert found == [False, True]
+
+
+def test_a_scale_by_estimates_that_are_replaced_is_not_reported() -> None:
+    monitor = _monitor(speed_mps=0.0)
+    off = StereoScaleEstimate(np.array([0.2, 0.0]), np.diag([1e-6, 1e-6]))
+    frame = _updated(FRAMES)
+    assert frame.seen is not None
+    _given(monitor, [replace(frame, estimate=replace(frame.estimate, stereo_scale=off))])
+    monitor.begun_again(FRAMES + 1, ImuVerdict(usable=False), [_updated(k) for k in range(FRAMES)])
+    monitor.close()
+    assert "scale-off" not in {f.code for f in monitor.findings}

@@ -88,12 +88,14 @@ def _frames(
     frames = []
     for event in taken:
         if isinstance(event, Observations):
+            restarted = ""
             try:
                 report = backend.update(event)
-            except DivergedError:
+            except DivergedError as error:
+                restarted = str(error)
                 report = backend.restart(event)
             if report.started:
-                frames.append(UpdatedFrame(event, report, backend.estimate()))
+                frames.append(UpdatedFrame(event, report, backend.estimate(), restarted))
         elif (sample := corrected(event, verdict)) is not None:
             backend.propagate(sample)
     return frames

@@ -69,6 +69,7 @@ class RunMonitor:
         """
         self._updates = UpdateChecks(camera, imu=imu)
         self._of_updates = set[int]()  # places of their findings among all
+        self._lasting = set[str]()  # codes of those that have not ended
         self._still = StillFeatures()
         self._image: Image | None = None  # left one of the present frame
         self._seen: Observations | None = None  # of the present frame
@@ -283,10 +284,15 @@ class RunMonitor:
         their estimates by number, with the integrity that the images leave them.
         """
         self._goes_on(index, verdict, f"; the {len(frames)} frames so far were estimated again")
-        if self._updates.contradiction is not None:
-            self._add(self._updates.contradiction.end(index))
         self._updates = self._updates.anew(imu=verdict.used)
-        return self._judged_again(frames, verdict)
+        self._scale_lines = []
+        before = self._lasting
+        self._lasting = set()
+        estimates = self._judged_again(frames, verdict)
+        message = f"frame {index}: that does not hold of the estimates that replace those before"
+        for code in sorted(before - self._lasting):
+            self._add([Finding(code, message, index, ended=True)])
+        return estimates
 
     def _judged_again(
         self, frames: Sequence[UpdatedFrame], verdict: ImuVerdict
@@ -321,6 +327,8 @@ class RunMonitor:
         self._goes_on(index, verdict)
         if self._inertial is None or verdict.used or not was_used:
             return
+        if self._updates.contradiction is not None:
+            self._add_of_updates(self._updates.contradiction.end(index))
         since = self._inertial.doubted_since(index)
         message = f"frame {index}: since frame {since} the estimate may have followed a wrong IMU"
         self._add([Finding("estimate-implausible", message, index, since)])
@@ -414,7 +422,7 @@ class RunMonitor:
             offset_s = self._inertial.clock_offset_s
             since = self._inertial.compared_since
             apart = self._updates.health.clock(index, estimate, offset_s, since)
-            self._add(apart)
+            self._add_of_updates(apart)
             if apart and self.can_begin_again:  # by images alone; else the filter is begun anew
                 self.imu_verdict = replace(self.imu_verdict, usable=False)
         self._report_scale(last=False)
@@ -432,16 +440,24 @@ class RunMonitor:
         are not reported again.
         """
         self._integrity.take_scale(measured=has_scale)
-        first = len(self.findings)
-        for finding in self._updates.frame(index, frame, measured=measured):
-            if finding.message in known:
-                self._integrity.take(finding)
-            else:
-                self._add([finding])
-        self._of_updates.update(range(first, len(self.findings)))
+        found = self._updates.frame(index, frame, measured=measured)
+        self._add_of_updates(found, known)
         if self._updates.contradiction is not None:
             self._integrity.take_innovation(frame.report.innovation_ratio)
         self._integrity.take_scale_doubt(index, frame.report.scale_doubt)
+
+    def _add_of_updates(self, findings: Iterable[Finding], known: Set[str] = frozenset()) -> None:
+        """Report what updates show; messages that are known already, not again."""
+        for finding in findings:
+            if finding.ended:
+                self._lasting.discard(finding.code)
+            elif finding.lasts:
+                self._lasting.add(finding.code)
+            if finding.message in known:
+                self._integrity.take(finding)
+            else:
+                self._of_updates.add(len(self.findings))
+                self._add([finding])
 
     def _report_scale(self, *, last: bool) -> None:
         """Report what the sensor says of the cameras' scale once its axes were compared, and are
@@ -449,7 +465,7 @@ class RunMonitor:
         """
         check = self._inertial
         if check is None or (not check.imu_at_fault and (check.axes_compared or last)):
-            self._add(self._scale_lines)
+            self._add_of_updates(self._scale_lines)
             self._scale_lines = []
 
     def close(self) -> None:

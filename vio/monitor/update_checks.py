@@ -23,6 +23,7 @@ class UpdatedFrame:
     seen: Observations | None  # None: as the back end was given none
     report: UpdateReport
     estimate: Estimate
+    restarted: str = ""  # why the back end was started again in it; empty: it was not
 
 
 class UpdateChecks:
@@ -54,10 +55,12 @@ class UpdateChecks:
         """Yield the findings of a frame; `measured`: whether a motion sensor carries the pose."""
         report = frame.report
         ratio = report.innovation_ratio
+        if frame.restarted:
+            yield from self.health.restarted(index, frame.restarted, frame.estimate)
         yield from self.health.frame(index, report, frame.estimate)
         position = frame.estimate.T_world_imu[:3, 3]
         yield from self._order.frame(index, position, ratio if measured else None)
-        if self.contradiction is not None:
+        if self.contradiction is not None and self.refusals.imu:
             yield from self.contradiction.frame(index, ratio)
         seen = frame.seen
         if seen is None:
