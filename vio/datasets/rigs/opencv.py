@@ -60,7 +60,7 @@ _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
 _LONG_NAME = 6  # letters
 _SAME = 1e-6  # share by which numbers that were written with fewer digits differ
 _MOST_NUMBERS = 100  # of a matrix; maps of pixels have more
-_FEWEST_NUMBERS = {"K": 9, "D": 4}  # of a matrix, and of the coefficients of a lens
+_FEWEST_NUMBERS = 4  # of a matrix, or of the coefficients of a lens
 UNREAD = object()  # value of an entry of which the name alone is known
 # Words for a matrix, and for a camera's side, of which other names consist: in small letters.
 _MATRIX_WORDS = ("cameramatrix", "cammatrix", "cammtx", "intrinsicmatrix", "intrinsics", "intrinsic",
@@ -338,11 +338,10 @@ def _of_side(entries: Entries, key: str, all_sides: tuple[tuple[str, str], ...])
     if key not in {"K0", "K1", "D0", "D1"}:
         return None
     words = _MATRIX_WORDS if key[0] == "K" else _DISTORTION_WORDS
-    least = _FEWEST_NUMBERS[key[0]]
     plain = {
         "".join(filter(str.isalnum, str(name))).lower(): str(name)
         for name, value in entries.items()
-        if value is UNREAD or count_numbers(value) >= least
+        if value is UNREAD or count_numbers(value) >= _FEWEST_NUMBERS
     }
     place = int(key[1])
     for word in words:
