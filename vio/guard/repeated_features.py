@@ -160,8 +160,8 @@ def _in_plane(before: FloatArray, now: FloatArray) -> bool:
     """Whether a motion along the images' plane, or about their axis, takes pixels (N, 4) of the frame
     before to those of the next one: a turn and, by the disparity, a shift.
     """
-    u, v, ur = before[:, 0], before[:, 1], before[:, 2]
-    terms = np.column_stack([u, v, u - ur, np.ones(len(u))])
+    disparity = before[:, 0] - before[:, 2]
+    terms = np.column_stack([before[:, :2], disparity, np.ones(len(before))])
     if len(terms) <= 2 * terms.shape[1]:
         return True
     fit = np.linalg.lstsq(terms, now[:, :2], rcond=None)[0]
