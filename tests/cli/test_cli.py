@@ -536,6 +536,17 @@ def test_an_unknown_option_shows_the_usage_of_its_command(
     assert "unrecognized arguments: --alignment" in message
 
 
+@pytest.mark.parametrize("argv", [["eval", "a", "--gt", "b"], ["inspect", "a", "--loops"]])
+def test_a_word_of_another_command_is_not_taken_for_one_spelt_alike(
+    argv: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(argv)
+    message = capsys.readouterr().err
+    assert "unrecognized arguments" in message
+    assert "did you mean" not in message
+
+
 @pytest.mark.parametrize(
     ("argv", "hint"),
     [

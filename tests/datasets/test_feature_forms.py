@@ -187,23 +187,47 @@ def test_says_nothing_of_healthy_features(name: str, motion: str, tmp_path: Path
     assert dataset.recording.notes == ()
 
 
-def test_the_pixels_of_images_of_another_size_are_doubted(tmp_path: Path) -> None:
-    arrays = _features()
-    cases = {
-        r"and the principal point is \(610, 180\)": {
-            **_without("image_size")(arrays),
-            "z": 2 * arrays["z"],
-        },
-    }
-    for words, changed in cases.items():
-        recording = open_dataset(make_npz(tmp_path / "features.npz", changed)).recording
-        assert len(recording.doubts) == 1
-        assert re.search(words, recording.doubts[0])
-    z = cases["upper left quarter"]["z"]
+def test_pixels_far_beyond_the_principal_point_are_doubted(tmp_path: Path) -> None:
+    arrays = _without("image_size")(_features())
+    arrays["z"] = 2 * arrays["z"]
+    recording = open_dataset(make_npz(tmp_path / "features.npz", arrays)).recording
+    assert len(recording.doubts) == 1
+    assert re.search(r"and the principal point is \(610, 180\)", recording.doubts[0])
     rows = zip(arrays["offsets"], arrays["offsets"][1:], strict=False)
-    frames = [(arrays["ids"][a:b], z[a:b], arrays["has_right"][a:b]) for a, b in rows]
-    vio.write_observations(tmp_path / "w.npz", CAMERA, arrays["frame_times_ns"], frames)
-    assert "upper left quarter" in open_dataset(tmp_path / "w.npz").recording.doubts[0]
+    frames = [(arrays["ids"][a:b], arrays["z"][a:b], arrays["has_right"][a:b]) for a, b in rows]
+    camera = StereoCamera(700.0, 700.0, 610.0, 180.0, 0.5)
+    vio.write_observations(tmp_path / "w.npz", camera, arrays["frame_times_ns"], frames)
+    (again,) = open_dataset(tmp_path / "w.npz").recording.doubts
+    assert recording.doubts[0].endswith(again)
+
+
+@pytest.mark.parametrize(("count", "first_px"), [(8, (20, 10)), (60, (300, 90))])
+def test_a_thing_may_lie_in_the_upper_left_quarter(
+    count: int, first_px: tuple[float, float], tmp_path: Path
+) -> None:
+    """As do the corners of a board: few, or in a part of the quarter alone."""
+    rng = np.random.default_rng(0)
+    corners = rng.uniform(first_px, (590, 178), (count, 2))
+    corners[:2] = first_px, (590, 178)
+    frames = []
+    for k in range(5):
+        uv = corners - [2.0 * k, 1.0 * k]
+        z = np.column_stack([uv, uv - [20.0, 0.0]]) + rng.normal(0, 0.2, (count, 4))
+        frames.append((np.arange(count), z, None))
+    vio.write_observations(tmp_path / "board.npz", CAMERA, 10**8 * np.arange(5), frames)
+    assert open_dataset(tmp_path / "board.npz").recording.notes == ()
+
+
+def test_far_points_have_the_same_whole_pixel_in_both_images(tmp_path: Path) -> None:
+    arrays = _features()
+    far = arrays["ids"] % 3 == 0
+    arrays["z"][far, 2:] = arrays["z"][far, :2]
+    arrays["z"] = np.rint(arrays["z"])
+    dataset = open_dataset(make_npz(tmp_path / "features.npz", arrays))
+    assert dataset.recording.notes == ()
+    seen = dataset.observations(0)
+    assert seen is not None
+    assert seen.has_right.sum() == arrays["has_right"][: len(seen)].sum()
 
 
 def test_the_left_pixel_itself_is_no_right_one(tmp_path: Path) -> None:

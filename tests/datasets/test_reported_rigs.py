@@ -378,6 +378,18 @@ def test_matrices_are_known_by_their_sides(names: tuple[str, ...], tmp_path: Pat
     np.testing.assert_allclose(rig.right[0].coefficients, truth.right[0].coefficients)
 
 
+@pytest.mark.parametrize("names", [("k1", "k2"), ("m0", "m1"), ("d0", "d1"), ("k0", "k1")])
+def test_numbers_are_no_matrices_of_sides(names: tuple[str, str], tmp_path: Path) -> None:
+    truth = forms.true_rig()
+    np.savez(tmp_path / "stereo.npz", **_matrices(truth), **dict.fromkeys(names, 0.1))
+    rig = vio.load_rig(tmp_path / "stereo.npz", image_size=SIZE)
+    assert rig.cam0.K.tolist() == truth.cam0.K.tolist()
+    np.testing.assert_allclose(rig.cam0.coefficients, truth.cam0.coefficients)
+    (tmp_path / "one.yaml").write_text(f"fx: 450.0\n{names[0]}: -0.3\n{names[1]}: 0.1\n")
+    with pytest.raises(CalibrationError, match="is no calibration of a known format"):
+        vio.load_rig(tmp_path / "one.yaml", image_size=SIZE)
+
+
 def test_a_report_of_kalibr_is_no_calibration(tmp_path: Path) -> None:
     file = tmp_path / "camera-results-cam.txt"
     file.write_text("Calibration results \n====================\nCamera-system parameters:\n")

@@ -667,6 +667,22 @@ def test_projections_with_centres_of_their_own_are_those_of_two_pinholes(tmp_pat
         vio.load_rig(write_storage(tmp_path / "q.yml", {"P1": P0, "P2": P1}, (64, 48)))
 
 
+def test_projections_may_have_fewer_digits_than_each_other(tmp_path: Path) -> None:
+    P0 = np.array([[435.2046959714599, 0, 32, 0], [0, 435.2046959714599, 24, 0], [0, 0, 1, 0]])
+    P1 = np.array(
+        [[435.2046959715, 0, 32.0000000001, -8], [0, 435.2046959715, 24, 0], [0, 0, 1, 0]]
+    )
+    rig = vio.load_rig(write_storage(tmp_path / "p.yml", {"P1": P0, "P2": P1}, (64, 48)))
+    assert rig.cam0 == rig.right[0]
+
+
+def test_a_calibration_is_found_beside_arrays_of_a_recording(tmp_path: Path) -> None:
+    for k in range(50):
+        np.savez(tmp_path / f"depth_{k}.npz", k1=np.zeros(()), k2=np.zeros(()))
+    write_storage(tmp_path / "ours.yml", opencv_matrices(), (64, 48))
+    np.testing.assert_allclose(vio.load_rig(tmp_path).cam0.K, RIG.cam0.K)
+
+
 def test_vertical_pairs_are_called_that(tmp_path: Path) -> None:
     down = replace(RIG, T_cam1_cam0=se3_from_parts(np.eye(3), [0.001, -0.2, 0.0]))
     with pytest.raises(CalibrationError, match=r"a vertical pair: the cameras are 0\.2 m apart"):

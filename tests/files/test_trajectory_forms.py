@@ -4,6 +4,7 @@ is tried against the other trajectory.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -496,6 +497,27 @@ def test_poses_without_times_are_told_so_before_an_extrinsic_is_asked_for(tmp_pa
     np.savetxt(tmp_path / "poses.txt", matrices)
     with pytest.raises(EvaluationError, match="30 poses without times"):
         evaluate(read_trajectory(tmp_path / "poses.txt"), TRUTH)
+
+
+@pytest.mark.parametrize(
+    ("names", "first", "second"),
+    [
+        ("time_sec,exposure_nsec", lambda t: f"{t // 10**9}.{t % 10**9:09d}", lambda t: 5_000_000),
+        ("time_sec,time_nsec", lambda t: f"{t // 10**9}.{t % 10**9:09d}", lambda t: t),
+        ("time_usec,time_nsec", lambda t: t // 1000, lambda t: t % 1000),
+    ],
+)
+def test_nanoseconds_beside_whole_times_are_no_rest(
+    names: str, first: Callable[[int], object], second: Callable[[int], object], tmp_path: Path
+) -> None:
+    rows = [
+        ",".join(map(str, (first(t), second(t), *p, *q)))
+        for t, p, q in zip(TIMES_NS.tolist(), P.tolist(), Q.tolist(), strict=True)
+    ]
+    (tmp_path / "poses.csv").write_text(f"{names},x,y,z,qx,qy,qz,qw\n" + "\n".join(rows) + "\n")
+    found = read_trajectory(tmp_path / "poses.csv")
+    assert found.times_ns is not None
+    assert np.abs(found.times_ns - TIMES_NS).max() < 1000
 
 
 def test_poses_that_a_camera_system_lost_and_rows_written_twice_are_left_out(

@@ -162,6 +162,17 @@ def test_single_wrong_features_are_left_out(columns: list[int]) -> None:
         assert np.isin(now.ids[~mask & told], left).mean() > 0.97
 
 
+def test_a_wrong_depth_in_the_frame_before_takes_no_feature() -> None:
+    """Its pixels are right in this frame, and fit the motion at another depth."""
+    rng = np.random.default_rng(8)
+    seen = flight()
+    for o in seen[::2]:
+        o.z[rng.random(len(o)) < 0.1, 2] -= 12.0
+    objects = ObjectMatches(CAMERA)
+    out = [objects.inspect(o, None) for o in seen]
+    assert sum(map(len, out)) > 0.998 * sum(map(len, seen))
+
+
 def test_exchanged_pixels_are_put_back_to_the_bit() -> None:
     seen = flight(visible=0.8)
     out, _ = inspected(changed(COLUMNS["exchanged"], seen))

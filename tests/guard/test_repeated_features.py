@@ -11,6 +11,7 @@ import pytest
 
 from tests.guard.test_matches import CAMERA, flight
 from vio.findings import Finding
+from vio.geometry.lie import so3_exp
 from vio.guard.guarded import GuardedFrontend
 from vio.guard.repeated_features import RepeatedFeatures
 from vio.records import (
@@ -77,6 +78,16 @@ def test_a_tracker_at_half_the_rate_gives_every_second_frame() -> None:
     assert "pixels of 100 %" in findings[0].message
 
 
+def test_a_coincidence_explains_no_repetition() -> None:
+    seen = flight()
+    half = _at_half_the_rate(seen)
+    z = half[2].z.copy()
+    z[0, 1] = half[1].z[half[1].ids == half[2].ids[0], 1][0]
+    half[2:4] = [replace(o, z=z) for o in half[2:4]]
+    out, _ = _inspected(half)
+    assert [bool(o.stale.all()) for o in out] == [k % 2 == 1 and k > 1 for k in range(len(out))]
+
+
 def test_points_that_stay_while_others_move_are_lost() -> None:
     seen = flight()
     out, findings = _inspected(_with_lost(seen))
@@ -102,8 +113,81 @@ def test_a_disparity_that_stays_is_measured_once(share: float) -> None:
     assert "disparities of" in findings[0].message
 
 
-def test_whole_pixels_may_be_equal() -> None:
-    seen = [replace(o, z=np.rint(o.z)) for o in flight()]
+STEPS_PX = [1.0, 0.5, 1.175, 1 / 16]  # the third: of images that were made smaller
+
+
+def _through(motion: str, count: int = 25) -> list[Observations]:
+    """Points without noise, with depths of 1 to 15 m, as a rig moves ahead, along its images' plane,
+    or turns.
+    """
+    rng = np.random.default_rng(1)
+    points = rng.uniform([-8, -5, 1], [8, 5, 15], (400, 3))
+    out = []
+    for k in range(count):
+        if motion == "ahead":
+            p = points - [0.0, 0.0, 0.05 * k]
+        elif motion == "aside, in a roll":
+            p = (points - [0.05 * k, 0.0, 0.0]) @ so3_exp([0.0, 0.0, 0.01 * k]).T
+        else:
+            p = points @ so3_exp([0.001 * k, 0.002 * k, 0.0]).T
+        uv = 450 * p[:, :2] / p[:, 2:] + [376.0, 240.0]
+        z = np.column_stack([uv, uv])
+        z[:, 2] -= 450 * 0.11 / p[:, 2]
+        ids = np.flatnonzero((p[:, 2] > 0.5) & (uv > 0).all(axis=1) & (uv < [752, 480]).all(axis=1))
+        out.append(observations(k, k * 10**8, ids, z[ids]))
+    return out
+
+
+MOTIONS = ["ahead", "aside, in a roll", "a turn"]
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("step_px", STEPS_PX)
+def test_multiples_of_a_step_may_be_equal(step_px: float, motion: str) -> None:
+    rng = np.random.default_rng(2)
+    seen = _through(motion)
+    noisy = [o.z + rng.normal(0.0, 0.3, o.z.shape) for o in seen]
+    seen = [replace(o, z=step_px * np.rint(z / step_px)) for o, z in zip(seen, noisy, strict=True)]
+    out, findings = _inspected(seen)
+    assert findings == []
+    assert all(a is b for a, b in zip(out, seen, strict=True))
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_steps_may_be_those_of_each_feature_s_scale(motion: str) -> None:
+    """As of key points in a pyramid of images, of which each level is 1.2 times smaller."""
+    rng = np.random.default_rng(2)
+    scales = 1.2 ** rng.integers(0, 8, 400)
+    seen = []
+    for o in _through(motion):
+        steps = scales[o.ids][:, None]
+        z = steps * np.rint((o.z + rng.normal(0.0, 0.3, o.z.shape)) / steps)
+        seen.append(replace(o, z=z))
+    out, findings = _inspected(seen)
+    assert findings == []
+    assert all(a is b for a, b in zip(out, seen, strict=True))
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_depths_in_whole_millimetres_may_be_equal(motion: str) -> None:
+    rng = np.random.default_rng(2)
+    seen = _through(motion)
+    for o in seen:
+        depth_m = 450 * 0.11 / (o.z[:, 0] - o.z[:, 2])
+        depth_m += rng.normal(0.0, 1.0, len(o)) * 0.001 * depth_m**2
+        o.z[:, :2] += rng.normal(0.0, 0.1, (len(o), 2))
+        o.z[:, 2] = o.z[:, 0] - 450 * 0.11 / (np.rint(1000 * depth_m) / 1000)
+        o.z[:, 3] = o.z[:, 1]
+    out, findings = _inspected(seen)
+    assert findings == []
+    assert all(a is b for a, b in zip(out, seen, strict=True))
+
+
+@pytest.mark.parametrize("digits", [np.float32, np.float64])
+@pytest.mark.parametrize("motion", MOTIONS[:2])
+def test_disparities_without_noise_may_stay(motion: str, digits: type) -> None:
+    """Along the images' plane no depth changes."""
+    seen = [replace(o, z=o.z.astype(digits).astype(float)) for o in _through(motion)]
     out, findings = _inspected(seen)
     assert findings == []
     assert all(a is b for a, b in zip(out, seen, strict=True))
@@ -126,16 +210,21 @@ def _stopping(slow: float, still: int) -> list[Observations]:
     z[:, 2] -= rng.uniform(5, 40, 100)
     out = []
     for k, step in enumerate([3.0, 2.0, 1.0, slow] + [0.0] * still):
-        z = z + np.array([step, 0.0, step, 0.0])
+        z = z + step * np.array([1.0, 0.5, 1.0, 0.5])
         out.append(observations(k, k * 10**8, np.arange(100), z))
     return out
 
 
-@pytest.mark.parametrize(("slow_px", "stands"), [(0.2, True), (0.8, False)])
-def test_images_without_noise_may_show_a_rig_at_rest(slow_px: float, stands: bool) -> None:
-    out, findings = _inspected(_stopping(slow_px, 6))
-    assert any(o.stale.any() for o in out) is not stands
-    assert (findings == []) is stands
+def test_images_without_noise_may_show_a_rig_at_rest() -> None:
+    out, findings = _inspected(_stopping(0.2, 6))
+    assert not any(o.stale.any() for o in out)
+    assert findings == []
+
+
+def test_a_rig_that_stops_at_once_is_at_rest_after_some_frames() -> None:
+    out, findings = _inspected(_stopping(0.8, 40))
+    assert [k for k, o in enumerate(out) if o.stale.any()] == [4, 5, 6, 7, 8]
+    assert [f.ended for f in findings] == [False, True]
 
 
 def test_an_object_before_a_rig_at_rest_repeats_nothing() -> None:

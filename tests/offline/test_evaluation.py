@@ -687,6 +687,15 @@ def test_error_names_the_unit_in_which_the_reference_covers_the_estimate(
         evaluate(estimate, wrong)
 
 
+def test_error_names_no_unit_in_which_the_reference_covers_a_part_alone() -> None:
+    """Of points that are surveyed each 5 s, which are within a second once they are divided."""
+    estimate = timed(wander(40))
+    reference = timed(wander(20))
+    sparse = replace(reference, times_ns=5 * 10**9 * np.arange(20) + 37 * 10**6)
+    with pytest.raises(EvaluationError, match=r"or allow a larger difference$"):
+        evaluate(estimate, sparse, max_time_difference_s=0.01)
+
+
 def test_error_reports_different_clocks() -> None:
     T = wander(10)
     with pytest.raises(

@@ -179,13 +179,13 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _near(word: str, known: Iterable[str], meant: Mapping[str, str]) -> str:
-    """Return a hint at the known word that another one means, or is most like; nothing where none
+    """Return a hint at the known word that another one means, else is most like; nothing where none
     is.
     """
     names = list(known)
     instead = meant.get(word)
-    if instead is not None and instead.split()[0] in names:
-        return f"; did you mean {instead}?"
+    if instead is not None:
+        return f"; did you mean {instead}?" if instead.split()[0] in names else ""
     near = difflib.get_close_matches(word, names, 1)
     return f"; did you mean {near[0]}?" if near else ""
 

@@ -34,6 +34,7 @@ class _Rules(NamedTuple):
     again: float = 0.01  # share of the features whose ids the next frame has
     scatter: float = 0.6  # of a point's motion beside that of two of any ids
     beyond: float = 3.0  # times the principal point, where no image of one size ends
+    parts: int = 32  # of a pixel, in which pixels may be measured
     filled: float = 0.8  # share of the upper left quarter that features of half the size reach
 
 
@@ -54,7 +55,8 @@ def without_placeholders(tracks: FeatureTracks) -> tuple[FeatureTracks, str | No
     taken so.
 
     These are pixels that are no numbers, pairs at or below zero that several rows share to the
-    last bit, as -1 -1, and the left pixel itself, to the last bit, in several rows.
+    last bit, as -1 -1, and the left pixel itself, to the last bit, in several rows: not where it is
+    a whole one, or a part of it, and so is the right one of a far point.
     """
     right = tracks.z[:, 2:]
     empty = np.isnan(right).any(axis=1)
@@ -63,6 +65,8 @@ def without_placeholders(tracks: FeatureTracks) -> tuple[FeatureTracks, str | No
     shared = np.zeros(len(right), dtype=np.bool_)
     shared[low] = (counts > 1)[place.reshape(-1)]
     own = tracks.has_right & (right == tracks.z[:, :2]).all(axis=1)
+    parts = tracks.z[:, :2] * _RULES.parts
+    own &= (parts != np.rint(parts)).any(axis=1)
     own &= own.sum() > 1
     held = tracks.has_right & (empty | shared | own)
     if not held.any():
@@ -240,7 +244,7 @@ def _of_places(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
     """Whether the left pixels lie in the image."""
     left = tracks.z[:, :2]
     if _outside(left, camera) <= _RULES.few:
-        return _of_quarter(left, camera)
+        return _of_quarter(tracks, camera)
     centre = np.array([camera.cu, camera.cv])
     if (left < -_RULES.near_px).any() and _outside(left + centre, camera) <= _RULES.few:
         return (
@@ -258,12 +262,18 @@ def _of_places(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
     )
 
 
-def _of_quarter(left: FloatArray, camera: StereoCamera) -> str | None:
-    """Whether left pixels (N, 2) fill the upper left quarter of the image, and no more."""
+def _of_quarter(tracks: FeatureTracks, camera: StereoCamera) -> str | None:
+    """Whether left pixels fill the upper left quarter of the image from corner to corner, and no
+    more. Few points may be those of one thing.
+    """
+    if camera.projection != "pinhole" or len(np.unique(tracks.ids)) < _RULES.fewest:
+        return None
     half = _half_size(camera)
-    farthest = left.max(axis=0)
+    nearest = tracks.z[:, :2].min(axis=0)
+    farthest = tracks.z[:, :2].max(axis=0)
     fills = (farthest <= (1 + _RULES.unlike) * half) & (farthest >= _RULES.filled * half)
-    if camera.projection != "pinhole" or not fills.all():
+    fills &= nearest <= (1 - _RULES.filled) * half
+    if not fills.all():
         return None
     return (
         "all features lie in the upper left quarter of the image, up to "

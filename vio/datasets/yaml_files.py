@@ -232,6 +232,11 @@ def matrix(value: object, shape: tuple[int, int] | None, where: str) -> FloatArr
     return found.reshape(size)
 
 
+def count_numbers(value: object) -> int:
+    """Return how many values an entry has that `matrix` reads."""
+    return len(_stated_shape(value)[1])
+
+
 def _stated_shape(value: object) -> tuple[tuple[int, int] | None, list[Any]]:
     """Return the rows and columns that an entry states (None: it does not), and its values in one
     list.

@@ -18,7 +18,7 @@ from vio.records import NS_PER_S, IntArray, Trajectory
 AssociationMode: TypeAlias = Literal["time", "frame"]
 _LONG_STEP_S = 2.0  # between poses of no reference, from which on their unit may be another one
 _SMALLER_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
-_COMMON = 0.5  # of the shorter of two spans of time, that both have
+_COMMON = 0.5  # of the span of an estimate, that the reference covers
 _LONGEST_S = 1e9  # fits integer nanoseconds
 
 
@@ -193,9 +193,8 @@ def _unit_hint(estimate_ns: IntArray, reference_ns: IntArray) -> str:
     for unit, factor in _SMALLER_UNITS.items():
         other = reference_ns[[0, -1]] / NS_PER_S / factor
         common = min(own[1], other[1]) - max(own[0], other[0])
-        shorter, longer = sorted((own[1] - own[0], other[1] - other[0]))
-        if common > _COMMON * shorter:
-            shares[unit] = common / longer
+        if common > _COMMON * (own[1] - own[0]):
+            shares[unit] = common / max(own[1] - own[0], other[1] - other[0])
     if not shares:
         return ""
     best = max(shares, key=shares.__getitem__)

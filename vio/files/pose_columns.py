@@ -63,8 +63,8 @@ _QUATERNION_ALONE = re.compile(r"(?:q|quat|quaternion|rot|rotation|att|attitude|
 # a component with the names of its frames behind, as tx_world_device
 _OF_FRAMES = re.compile(r"([tpq][xyzw])_[a-z]+_[a-z]+")
 # whole seconds of a stamp, and the rest of it in the next column, as header.stamp.sec has them
-_SECONDS = re.compile(r"(?<!n)(?<!nano)(?<!milli)(?<!micro)(?:secs?|seconds?)$")
-_NANOSECONDS = re.compile(r"(?:n|nano)(?:secs?|seconds?)$")
+_SECONDS = re.compile(r"(.*?)(?:secs?|seconds?)")
+_NANOSECONDS = re.compile(r"(.*?)(?:n|nano)(?:secs?|seconds?)")
 _SPELT = re.compile(r"\b(?:w[ ,]*x[ ,]*y[ ,]*z|x[ ,]*y[ ,]*z[ ,]*w)\b", re.IGNORECASE)
 _WORDS = re.compile(r"[A-Za-z_][A-Za-z_0-9.]*")
 
@@ -200,7 +200,7 @@ def _named_columns(cells: Sequence[str], *, w_first: bool) -> PoseColumns | None
     after = stamp + 1
     unit = time_unit(cells[stamp])
     nanoseconds = None
-    if _SECONDS.search(names[stamp]) and any(map(_NANOSECONDS.search, names[after : after + 1])):
+    if _is_rest(names[stamp : after + 1]):
         unit = "s"
         nanoseconds = after
     return PoseColumns(
@@ -208,6 +208,17 @@ def _named_columns(cells: Sequence[str], *, w_first: bool) -> PoseColumns | None
         names_stamp=named_stamp is not None,
         notes=notes,
     )
+
+
+def _is_rest(names: Sequence[str]) -> bool:
+    """Return whether the second of two columns has the nanoseconds of the first one's seconds: of the
+    same name before them.
+    """
+    if len(names) < 2:
+        return False
+    seconds = _SECONDS.fullmatch(names[0])
+    rest = _NANOSECONDS.fullmatch(names[1])
+    return seconds is not None and rest is not None and seconds[1] == rest[1]
 
 
 def _quaternion(

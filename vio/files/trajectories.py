@@ -284,9 +284,11 @@ def _with_orientations(
 
 
 def _stamp_texts(table: _Table, columns: PoseColumns) -> list[str]:
-    """Return the stamps as text, with the nanoseconds that stand in a column of their own."""
+    """Return the stamps as text, with the nanoseconds that stand in a column of their own, unless
+    seconds have decimals already.
+    """
     stamps = table.column(columns.stamp)
-    if columns.nanoseconds is None:
+    if columns.nanoseconds is None or any("." in stamp for stamp in stamps):
         return stamps
     parts = table.column(columns.nanoseconds)
     return [f"{s}.{ns.zfill(9)}" for s, ns in zip(stamps, parts, strict=True)]

@@ -26,7 +26,7 @@ from vio.frontend.outliers import (
 from vio.frontend.prediction import prior_pixels
 from vio.frontend.scene_motion import SceneMotion
 from vio.frontend.stereo_match import EpipolarRowModel
-from vio.geometry.lie import FloatArray, se3_exp, se3_log
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.records import BoolArray, IntArray, Observations, TrackPrior, shared_rows
 
@@ -153,7 +153,39 @@ class ObjectMatches(Finder):
         else:
             errors_px = self._learn(points, found)
             dropped[shared.rows[deep]] = errors_px > _OBJECTS.wrong_ratio * limit_px
+            self._keep_of_other_depth(dropped, seen, shared, found, limit_px)
         return dropped
+
+    def _keep_of_other_depth(
+        self,
+        dropped: BoolArray,
+        seen: Observations,
+        shared: _Shared,
+        found: Consensus,
+        limit_px: float,
+    ) -> None:
+        """Keep the features that only their depth in the frame before contradicts: by the depth that
+        they have in this one, else at any depth, they fit the motion.
+
+        Args:
+            dropped: (N,) of a frame; changed.
+            seen: of the frame.
+            shared: of it and the frame before.
+            found: the motion between them.
+            limit_px: how far off the motion a feature may be.
+        """
+        rows = np.flatnonzero(dropped[shared.rows])
+        if not len(rows):
+            return
+        T = found.T_curr_prev
+        left_before = shared.before[rows, :2]
+        off_px = epipolar_distance(self._camera, T, left_before, shared.left[rows], self._near_m)
+        now = shared.rows[rows]
+        points, valid = triangulate(self._camera, seen.z[now])
+        deep = valid & seen.has_right[now]
+        back = se3_inverse(T)
+        off_px[deep] = pixel_errors(self._camera, back, points[deep], left_before[deep])
+        dropped[now[off_px <= limit_px]] = False
 
     def _consensus(
         self,

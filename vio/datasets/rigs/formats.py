@@ -49,7 +49,13 @@ from vio.datasets.rigs.kimera import pair_beside, read_kimera
 from vio.datasets.rigs.kitti_odometry import kitti_rig
 from vio.datasets.rigs.middlebury import read_middlebury
 from vio.datasets.rigs.names import named_calibration
-from vio.datasets.rigs.opencv import is_opencv, read_arrays, read_entries, rig_from_opencv
+from vio.datasets.rigs.opencv import (
+    UNREAD,
+    is_opencv,
+    read_arrays,
+    read_entries,
+    rig_from_opencv,
+)
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import Source, stereo_pose_on_imu
 from vio.datasets.sides import side_word
@@ -153,16 +159,23 @@ def find_calibration(folder: Path) -> Path | None:
 
 def _by_content(folder: Path) -> Path | None:
     """Return the first file of a folder whose content is that of a known format."""
-    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in _OTHERS and f.is_file())
+    files = [f for f in folder.iterdir() if f.suffix.lower() in _OTHERS and f.is_file()]
+    # archives are a recording's rather than a calibration
+    files.sort(key=lambda file: (_is_archive(file), file))
     known = [file for file in files[:_MAX_OTHERS] if _is_known(file)]
     # the settings name the files of their cameras
     return min(known, key=_is_of_one_camera, default=None)
 
 
+def _is_archive(file: Path) -> bool:
+    return file.suffix.lower() == ".npz"
+
+
 def _is_known(file: Path) -> bool:
     try:
-        if file.suffix.lower() == ".npz":  # whose arrays may be those of a recording
-            return is_opencv(dict.fromkeys(npz_names(file), True))
+        # arrays of a recording are not read
+        if _is_archive(file) and not is_opencv(dict.fromkeys(npz_names(file), UNREAD)):
+            return False
         entries = _entries(file)
     except DataError:
         return False

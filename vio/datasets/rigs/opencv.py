@@ -24,6 +24,7 @@ from vio.datasets.yaml_files import (
     MAX_BYTES,
     Entries,
     as_number,
+    count_numbers,
     lens_model,
     matrix,
     read_yaml_file,
@@ -57,7 +58,10 @@ _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
     "P1": ("P2", "RIGHT.P", "projMatrixR", "PR"),
 }  # fmt: skip
 _LONG_NAME = 6  # letters
+_SAME = 1e-6  # share by which numbers that were written with fewer digits differ
 _MOST_NUMBERS = 100  # of a matrix; maps of pixels have more
+_FEWEST_NUMBERS = 4  # of a matrix, or of the coefficients of a lens
+UNREAD = object()  # value of an entry of which the name alone is known
 # Words for a matrix, and for a camera's side, of which other names consist: in small letters.
 _MATRIX_WORDS = ("cameramatrix", "cammatrix", "cammtx", "intrinsicmatrix", "intrinsics", "intrinsic",
             "matrix", "mtx", "k", "m")  # fmt: skip
@@ -224,7 +228,10 @@ def _stereo_pose(entries: Entries, where: str) -> FloatArray:
 def _rectified(entries: Entries, where: str, width: int, height: int) -> Rig:
     P0, P1 = (_required(entries, key, (3, 4), where) for key in ("P0", "P1"))
     with naming(where):
-        if not np.allclose(P0[1:, :3], P1[1:, :3], rtol=1e-6) or P0[0, 0] != P1[0, 0]:
+        cx = P0[0, 2], P1[0, 2]
+        alike = P1[:, :3].copy()
+        alike[0, 2] = cx[0]  # without CALIB_ZERO_DISPARITY that of the right camera is its own
+        if not np.allclose(P0[:, :3], alike, rtol=_SAME, atol=_SAME):
             raise CalibrationError(
                 "P1 and P2 differ in focal length or in cy, as those of no rectified pair do; give "
                 "those of one call of stereoRectify"
@@ -235,7 +242,7 @@ def _rectified(entries: Entries, where: str, width: int, height: int) -> Rig:
             raise CalibrationError(fault)
         baseline = -float(shift[0])
         note = f"{where}: holds P1 and P2 only, so the images are taken to be rectified"
-        if P0[0, 2] != P1[0, 2]:  # without CALIB_ZERO_DISPARITY
+        if not np.isclose(*cx, rtol=_SAME):
             right = camera_from_matrix(P1[:, :3], width, height, name="P2")
             T_cam1_cam0 = se3_from_parts(np.eye(3), [-baseline, 0.0, 0.0])
             return Rig(camera, right, T_cam1_cam0, notes=(note,))
@@ -325,12 +332,17 @@ def _name(entries: Entries, key: str) -> str:
 
 def _of_side(entries: Entries, key: str, all_sides: tuple[tuple[str, str], ...]) -> str | None:
     """Return the entry whose name is a word for a camera's matrix, or its distortion, with that of a
-    side before or behind it, where the other side has one alike.
+    side before or behind it, where the other side has one alike. Numbers alone, as the coefficients
+    `k1` and `k2` of one camera, are neither.
     """
     if key not in {"K0", "K1", "D0", "D1"}:
         return None
     words = _MATRIX_WORDS if key[0] == "K" else _DISTORTION_WORDS
-    plain = {"".join(filter(str.isalnum, str(name))).lower(): str(name) for name in entries}
+    plain = {
+        "".join(filter(str.isalnum, str(name))).lower(): str(name)
+        for name, value in entries.items()
+        if value is UNREAD or count_numbers(value) >= _FEWEST_NUMBERS
+    }
     place = int(key[1])
     for word in words:
         for sides in all_sides:
