@@ -219,7 +219,7 @@ OTHERS: dict[str, tuple[Says, float, float]] = {
     "late: frames by rows": (lambda n: _found_delay(0.5, int(n)) != 0.0, 9, 10),
     "late: matches by rows": (lambda n: _found_delay(0.5, matches=int(n)) != 0.0, 29, 30),
     "late: whole frames": (lambda x: _found_delay(1.0 - x) != 1.0, 0.13, 0.17),
-    "late: explained": (lambda x: _found_delay(0.5, 300, 900, x) == 0.0, 10.0, 13.0),
+    "late: explained": (lambda x: _found_delay(0.5, 300, 900, x) == 0.0, 3.0, 4.0),
     "late: forgotten": (lambda x: _found_delay(0.5, then=x) != 0.0, 0.085, 0.115),
     "late: sigmas": (lambda x: _found_delay(0.5, 10, 40, noise_px=x) == 0.0, 1.5, 2.0),
     "gap: seconds": (lambda x: is_long_gap(round(1e9 * x), 10_000_000), 0.72, 0.88),
