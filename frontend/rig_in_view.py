@@ -137,8 +137,11 @@ class RigInView(Finder):
         moves = median(flow_px[stays]) > _RIG.still_px
         if not self._before.done and (moves or self._before.stands):
             behind = ~stays & (flow_px <= problem.limit_px)
-            told = moves and measured is None
-            is_before = told and _is_scene(problem, points, stays, behind, may_be_nearer=False)
+            is_before = (
+                moves
+                and measured is None
+                and _is_scene(problem, points, stays, behind, may_be_nearer=False)
+            )
             if self._before.see(index, is_before):
                 self._report_before(index, float(behind.mean()))
         if self._moved >= _RIG.moved_frames:
@@ -186,13 +189,13 @@ class RigInView(Finder):
             message = f"frame {index}: no points stay behind those that move any more"
             self._found.append(Finding(_CODE, message, index, ended=True))
             return
+        since = self._before.since
         message = (
             f"frame {index}: {100 * share:.0f} % of the points have stayed at the same pixels since "
-            f"frame {self._before.since}, behind or all over those that are taken for the scene: these may be "
-            "of something that moves before a rig that stands still"
+            f"frame {since}, behind or all over those that are taken for the scene: these may be of "
+            "something that moves before a rig that stands still"
         )
         figures = {"scene_share": share}
-        since = self._before.since
         self._found.append(Finding(_CODE, message, index, since, lasts=True, figures=figures))
 
     def _report(self, index: int, share: float) -> None:

@@ -247,17 +247,13 @@ def write_observations(
     if fault := FRAME_PACE.fault(times_ns) or SAMPLE_PACE.fault(samples.times_ns):
         raise DataError(fault)
     seen = [_one_frame(k, int(times_ns[k]), frame) for k, frame in enumerate(frames)]
-    tracks, note = without_placeholders(feature_tracks(dict(enumerate(seen)), len(seen)))
-    if fault := features_fault(camera, tracks):
-        raise DataError(f"features: {fault}")
+    tracks, notes = _examined(feature_tracks(dict(enumerate(seen)), len(seen)), camera, "features")
     T = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
     recording = Recording(
         "features", Path(path), camera, T, times_ns, False, samples.kinds, reference
     )
-    notes = (note, features_doubt(camera, tracks))
-    recording = replace(recording, notes=tuple(one for one in notes if one is not None))
-    if note is not None:
-        seen = [tracks.at(k, int(times_ns[k])) for k in range(len(seen))]
+    recording = replace(recording, notes=notes)
+    seen = [tracks.at(k, int(times_ns[k])) for k in range(len(seen))]
     write_observation_log(Path(path), recording, seen, samples)
 
 
@@ -299,7 +295,7 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
     notes = tuple(str(note) for note in arrays["notes"])
     if is_foreign:
         tracks, found = _examined(tracks, camera, path)
-        notes = (*notes, *found)
+        notes = (*notes, *(f"{path}: {text}" for text in found))
     motion = MotionSamples[MotionSample](
         arrays["motion_times_ns"], arrays["motion_values"], arrays["motion_is_imu"]
     )
@@ -324,18 +320,18 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
 
 
 def _examined(
-    tracks: FeatureTracks, camera: StereoCamera, path: Path
+    tracks: FeatureTracks, camera: StereoCamera, where: object
 ) -> tuple[FeatureTracks, tuple[str, ...]]:
     """Return the features of another program without placeholders, and notes on them.
 
     Raises:
-        DataError: they are not what they must be.
+        DataError: they are not what they must be; `where` begins it.
     """
     tracks, note = without_placeholders(tracks)
     if fault := features_fault(camera, tracks):
-        raise DataError(f"{path}: {fault}")
+        raise DataError(f"{where}: {fault}")
     found = (note, features_doubt(camera, tracks))
-    return tracks, tuple(f"{path}: {text}" for text in found if text is not None)
+    return tracks, tuple(text for text in found if text is not None)
 
 
 def _checked(arrays: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.ndarray]:

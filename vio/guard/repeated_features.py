@@ -28,9 +28,8 @@ class _RepeatRules:
     """When numbers that are equal were not measured."""
 
     min_shared: int = 20  # features of two frames, with fewer of which a frame tells nothing
-    few: float = (
-        0.5  # share of the features that repeat their pixels; else the rig may have stopped …
-    )
+    # share of the features that repeat their pixels; else the rig may have stopped …
+    few: float = 0.5
     moved_px: float = 0.5  # … unless the last flow of the others (median) was more
     most: float = 0.95  # share of the features that repeat their pixels …
     longest: int = 5  # … in so many frames in a row at most; longer, it is a rig at rest
