@@ -59,8 +59,12 @@ def _build_precomputed(
 
     if dataset is None:
         raise ConfigError("frontend.name: precomputed needs a recording of features")
-    checked = dataset.recording.run_motion is not None
-    return PrecomputedFrontend(dataset.observations, checks_matches=checked)
+    recording = dataset.recording
+    return PrecomputedFrontend(
+        dataset.observations,
+        checks_matches=recording.run_motion is not None,
+        checks_repeats=recording.repeats_settled,
+    )
 
 
 BUILDERS: dict[str, Callable[[StereoCamera, FrontendSettings, Dataset | None], Frontend]] = {

@@ -25,14 +25,23 @@ class PrecomputedFrontend:
     """Return recorded observations in place of tracking."""
 
     def __init__(
-        self, source: Callable[[int], Observations | None], *, checks_matches: bool = False
+        self,
+        source: Callable[[int], Observations | None],
+        *,
+        checks_matches: bool = False,
+        checks_repeats: bool = False,
     ) -> None:
         """Take what returns the observations of a frame by its index, such as
-        `Dataset.observations`; `checks_matches`: a run of this package made them, and has checked
-        them.
+        `Dataset.observations`.
+
+        Args:
+            source: returns the observations of a frame.
+            checks_matches: a run of this package made them, and has checked them.
+            checks_repeats: those that repeat old pixels are marked, or taken on purpose.
         """
         self._source = source
         self.checks_matches = checks_matches
+        self.checks_repeats = checks_repeats
         self.checks_objects = checks_matches
         # frames by which the right pixels are late, as `vio.guard.repairing.repaired` has it
         self.right_delay = 0

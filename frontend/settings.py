@@ -125,6 +125,10 @@ class FrontendSettings(Section):
         "precomputed front end",
     )
     prior: bool = setting(True, "give the front end the filter's prediction of the feature pixels")
+    checks: bool = setting(
+        True,
+        "leave out images and features that contradict the camera; false: for comparisons",
+    )
     readout_ms: float | None = setting(
         None,
         "rolling shutter: time from the exposure of the first row to that of the last, negative if "

@@ -138,6 +138,15 @@ class ChecksMatches(Protocol):
 
 
 @runtime_checkable
+class ChecksRepeats(Protocol):
+    """A front end that may know which features repeat old pixels, so that `vio.guard` need not ask."""
+
+    @property
+    def checks_repeats(self) -> bool:
+        """Whether it knows those of its features."""
+
+
+@runtime_checkable
 class ChecksObjects(Protocol):
     """A front end that tells objects that cover much of the image from the scene itself, so that
     `vio.guard` need not.

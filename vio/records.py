@@ -721,6 +721,8 @@ class Recording:
     motion_notes: tuple[str, ...] = ()  # those of them that are on motion samples only
     # observation logs: what the run behind the log used; None: not known
     run_motion: RunMotion | None = None
+    # features: those that repeat old pixels are as the reader or `dataset.repeated_tracks` has them
+    repeats_settled: bool = False
     # (F,) increasing, by which images are named where that counts frames; None: it does not
     image_numbers: IntArray | None = None
 

@@ -229,6 +229,7 @@ def test_literal_mode_keeps_repeats_and_notes_the_frames(tmp_path: Path) -> None
         make_npz(tmp_path / "a.npz", arrays), DatasetSettings(repeated_tracks="literal")
     )
     assert not dataset.tracks.stale.any()
+    assert dataset.recording.repeats_settled
     assert "1 of 14 feature frames are stale" in dataset.recording.notes[-1]
     assert "used as they are" in dataset.recording.notes[-1]
 

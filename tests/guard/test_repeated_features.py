@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.guard.test_matches import CAMERA, flight
+from vio.config import load_config
+from vio.datasets import open_dataset
+from vio.datasets.observation_log import write_observations
 from vio.findings import Finding
+from vio.frontend.precomputed import PrecomputedFrontend
 from vio.geometry.lie import so3_exp
 from vio.guard.guarded import GuardedFrontend
 from vio.guard.repeated_features import RepeatedFeatures
@@ -22,6 +27,7 @@ from vio.records import (
     observations,
     shared_rows,
 )
+from vio.runs.pipeline import run
 
 
 def _inspected(seen: Sequence[Observations]) -> tuple[list[Observations], list[Finding]]:
@@ -267,3 +273,34 @@ def test_every_front_end_that_does_not_check_itself_is_asked() -> None:
         for o in seen
     ]
     assert stale == [k % 2 == 1 and k > 1 for k in range(len(seen))]
+
+
+@pytest.mark.parametrize("settled", [True, False])
+def test_a_reader_that_knows_what_repeats_is_believed(settled: bool) -> None:
+    seen = _at_half_the_rate(flight())
+    source = PrecomputedFrontend(lambda index: seen[index], checks_repeats=settled)
+    frontend = GuardedFrontend(source, CAMERA)
+    outputs = [frontend.process(StereoFrame(o.frame_index, o.time_ns, None, None)) for o in seen]
+    assert any(o.observations.stale.any() for o in outputs) is not settled
+    found = {f.code for o in outputs for f in o.findings}
+    assert ("frames-repeated" in found) is not settled
+
+
+@pytest.mark.parametrize(
+    ("overrides", "is_checked"),
+    [
+        ((), True),
+        (("frontend.checks=false",), False),
+        (("dataset.repeated_tracks=literal",), False),
+    ],
+)
+def test_features_are_taken_as_they_are_on_request(
+    overrides: tuple[str, ...], is_checked: bool, tmp_path: Path
+) -> None:
+    seen = _at_half_the_rate(flight())
+    file = tmp_path / "tracks.npz"
+    frames = [(o.ids, o.z, o.has_right) for o in seen]
+    write_observations(file, CAMERA, [o.time_ns for o in seen], frames)
+    config = load_config(overrides=overrides)
+    result = run(open_dataset(file, config.dataset), config)
+    assert any(frame.stale > 0 for frame in result.frames) is is_checked

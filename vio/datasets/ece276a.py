@@ -133,6 +133,7 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
         motion=frozenset({"velocity"}),
         reference=None,
         notes=(*extrinsics_notes, *notes),
+        repeats_settled=True,
     )
     motion = velocity_samples(times_ns, linear, angular)
     return FeatureDataset(recording, tracks, motion, np.arange(count))

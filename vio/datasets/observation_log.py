@@ -314,6 +314,7 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
         landmarks_reference=_landmarks(arrays),
         notes=notes,
         run_motion=run_motion,
+        repeats_settled=settings is not None and settings.repeated_tracks == "literal",
         image_numbers=arrays.get("image_numbers"),
     )
     return FeatureDataset(recording, tracks, motion, frames)

@@ -31,13 +31,13 @@ class DatasetSettings(Section):
     )
     repeated_tracks: RepeatsMode = setting(
         "auto",
-        "feature files, rows that repeat old pixels while the vehicle moves: mark them stale and "
-        "give a new id (split), mark them (flag), use them (literal); auto: split where the track "
-        "went on at another point, else flag",
+        "feature files, rows that repeat old pixels in motion: mark them stale and give a new id "
+        "(split), mark them (flag), use them (literal); auto: split where the track went on at "
+        "another point, else flag",
     )
     calibration: Path | None = setting(
         None,
-        "the calibration file, in the place of the recording's own",
+        "the calibration file, in place of the recording's own",
     )
     folders: str | None = setting(
         None,

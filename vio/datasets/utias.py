@@ -72,6 +72,7 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
         reference=_reference(arrays, path, times_ns),
         landmarks_reference=_landmarks(arrays, path, features.shape[2]),
         notes=notes,
+        repeats_settled=True,
     )
     motion = velocity_samples(times_ns, linear, angular)
     return FeatureDataset(recording, tracks, motion, np.arange(count))

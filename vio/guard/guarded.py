@@ -21,7 +21,7 @@ from vio.guard.repeated_features import RepeatedFeatures
 from vio.guard.swap import SwapDetector
 from vio.guard.torn import TornImages
 from vio.guard.turned_pair import TurnedPair
-from vio.protocols import ChecksMatches, ChecksObjects, FollowsRight, Frontend
+from vio.protocols import ChecksMatches, ChecksObjects, ChecksRepeats, FollowsRight, Frontend
 from vio.records import (
     FrontendOutput,
     Observations,
@@ -63,7 +63,7 @@ class GuardedFrontend:
     see `vio.protocols.Frontend`.
 
     Images that no front end takes are handed on as they are. The features of a front end that checks
-    them itself (`vio.protocols.ChecksMatches`, `ChecksObjects`) are not checked again.
+    them itself (`vio.protocols.ChecksMatches`, `ChecksObjects`, `ChecksRepeats`) are not checked again.
     """
 
     def __init__(self, frontend: Frontend, camera: StereoCamera) -> None:
@@ -72,8 +72,9 @@ class GuardedFrontend:
         # the front end, where it may check matches and objects itself; slow to ask in every frame
         self._may_check = frontend if isinstance(frontend, ChecksMatches) else None
         self._may_check_objects = frontend if isinstance(frontend, ChecksObjects) else None
+        checks_repeats = isinstance(frontend, ChecksRepeats) and frontend.checks_repeats
+        self._repeats = None if checks_repeats else RepeatedFeatures()
         self._checks = image_checks(camera)
-        self._repeats = RepeatedFeatures()
         self._matches = RightMatches(camera)
         self._objects = ObjectMatches(camera)
         self._never = NeverMatched() if self._pair else None
@@ -126,7 +127,7 @@ class GuardedFrontend:
         """
         seen = output.observations
         is_checked = self._may_check is not None and self._may_check.checks_matches
-        if not is_checked:
+        if not is_checked and self._repeats is not None:
             seen = self._repeats.inspect(seen)
             found = (*found, *self._repeats.take_findings())
         if not right_usable:
