@@ -162,6 +162,27 @@ def test_single_wrong_features_are_left_out(columns: list[int]) -> None:
         assert np.isin(now.ids[~mask & told], left).mean() > 0.97
 
 
+@pytest.mark.parametrize("share", [0.2, 0.5])
+@pytest.mark.parametrize("roll_rad", [0.0, 0.03])
+def test_right_pixels_of_other_features_are_left_out_from_the_first_frame(
+    share: float, roll_rad: float
+) -> None:
+    rng = np.random.default_rng(9)
+    seen = flight()
+    wrong = []
+    for o in seen[:4]:
+        o.z[:, 3] += roll_rad * (o.z[:, 2] - CAMERA.cu)
+        true = o.z[:, 3].copy()
+        chosen = rng.permutation(len(o))[: int(share * len(o))]
+        o.z[chosen, 2:] = np.roll(o.z[chosen, 2:], 1, axis=0)
+        wrong.append(np.abs(o.z[:, 3] - true) > 10.0)
+    checks = RightMatches(CAMERA)
+    for o, mask in zip(seen, wrong, strict=False):
+        out = checks.inspect(o)
+        assert not out.has_right[mask].any()
+        assert out.has_right[~mask].mean() > 0.95
+
+
 def test_a_wrong_depth_in_the_frame_before_takes_no_feature() -> None:
     """Its pixels are right in this frame, and fit the motion at another depth."""
     rng = np.random.default_rng(8)

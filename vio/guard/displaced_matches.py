@@ -28,6 +28,7 @@ class _RowRules:
     min_matches: int = 20  # in a frame that tells
     min_frames: int = 5  # that the field was learned from
     memory: float = 0.97  # per frame, of the normal equations
+    first_steps: int = 10  # of the fit to the first frame, in which wrong rows lose their weight
     # median distance from the field that contradicts it: that of rows that are random within 1.5
     # px, in which descriptors are matched …
     min_rows_px: float = 0.75
@@ -67,6 +68,8 @@ class DisplacedMatches(MatchCheck):
             return seen if state.since is None else without_right(seen)
         terms = self._terms(z)
         rows = z[:, 3] - z[:, 1]
+        if not self._frames:
+            self._field = _field_of(terms, rows)
         distance_px = np.abs(rows - terms @ self._field)
         off_px = median(distance_px)
         limit_px = max(_ROWS.min_rows_px, _ROWS.clear_ratio * self._usual_px)
@@ -100,7 +103,7 @@ class DisplacedMatches(MatchCheck):
         """
         limit_px = max(_ROWS.min_wrong_px, _ROWS.wrong_ratio * self._usual_px)
         wrong = distance_px > limit_px
-        if self._frames < _ROWS.min_frames or not wrong.any():
+        if not wrong.any():
             return seen
         dropped = np.zeros(len(seen), dtype=np.bool_)
         dropped[seen.has_right] = wrong
@@ -122,10 +125,30 @@ class DisplacedMatches(MatchCheck):
     def _learn(self, terms: FloatArray, rows: FloatArray, off_px: float) -> None:
         self._normal *= _ROWS.memory
         self._moment *= _ROWS.memory
-        sigma = ROW_SIGMA_PX if self._frames else np.inf
-        add_equations(terms, rows, self._field, sigma, self._normal, self._moment)
-        self._field = self._moment.copy()
-        solve_positive(self._normal + 1e-6 * np.eye(_TERMS), self._field)
-        if self._frames:
-            self._usual_px += _ROWS.usual_gain * (off_px - self._usual_px)
+        add_equations(terms, rows, self._field, ROW_SIGMA_PX, self._normal, self._moment)
+        self._field = _solution(self._normal, self._moment)
         self._frames += 1
+        gain = max(_ROWS.usual_gain, 1.0 / self._frames)
+        self._usual_px += gain * (off_px - self._usual_px)
+
+
+def _field_of(terms: FloatArray, rows: FloatArray) -> FloatArray:
+    """The field (6,) that most rows (N,) of one frame agree with, whatever the others are; terms
+    (N, 6).
+    """
+    field = np.zeros(_TERMS)
+    field[0] = median(rows)
+    for _ in range(_ROWS.first_steps):
+        sigma_px = max(ROW_SIGMA_PX, median(np.abs(rows - terms @ field)))
+        normal = np.zeros((_TERMS, _TERMS))
+        moment = np.zeros(_TERMS)
+        add_equations(terms, rows, field, sigma_px, normal, moment)
+        field = _solution(normal, moment)
+    return field
+
+
+def _solution(normal: FloatArray, moment: FloatArray) -> FloatArray:
+    """The field (6,) of normal equations (6, 6), (6,)."""
+    field = moment.copy()
+    solve_positive(normal + 1e-6 * np.eye(_TERMS), field)
+    return field
