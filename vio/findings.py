@@ -255,7 +255,7 @@ CODES: dict[str, Code] = {
     ),
     "other-calibration": Code(
         "degraded",
-        "rows of left and right images differ by far more than a calibration can be off",
+        "rows of left and right images differ beyond any calibration error, or by distortion",
         "check that calibration and images belong together",
     ),
     "calibration-misread": Code(

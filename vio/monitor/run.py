@@ -22,6 +22,7 @@ from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import OF_THE_STATE, IntegrityMonitor, Mark
+from vio.monitor.lens_distortion import LensCheck
 from vio.monitor.still_features import StillFeatures
 from vio.monitor.update_checks import UpdateChecks, UpdatedFrame
 from vio.records import (
@@ -74,6 +75,8 @@ class RunMonitor:
         self._image: Image | None = None  # left one of the present frame
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
+        is_pair = camera.kind == "stereo" and camera.projection == "pinhole"
+        self._lenses = LensCheck(camera) if is_pair else None
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
         self._faults = ImuFaultReport() if imu else None
@@ -197,6 +200,8 @@ class RunMonitor:
             self._add(self._silence.frame(seen.frame_index, seen.time_ns))
         if self._repeated:
             return
+        if self._lenses is not None:
+            self._look_at_lenses(self._lenses, seen)
         self._frozen.observations(seen)
         held_since = self._frozen.take_held()
         if held_since is not None:
@@ -210,6 +215,12 @@ class RunMonitor:
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
             self._doubt_imu(self._inertial.doubt)
+
+    def _look_at_lenses(self, lenses: LensCheck, seen: Observations) -> None:
+        found = lenses.frame(seen)
+        self._lenses = None if lenses.done else lenses
+        if found is not None:
+            self._add([found])
 
     def _doubt_imu(self, why: str) -> None:
         """Take why the IMU is not to be used for now; nothing: it may be used."""

@@ -1,0 +1,122 @@
+"""Rectified pixels that still have the distortion of the lenses, or one too much taken out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from vio.findings import Finding
+from vio.geometry.lie import FloatArray, so3_exp
+from vio.geometry.stereo import StereoCamera
+from vio.monitor.lens_distortion import LensCheck
+from vio.records import Observations, observations
+
+CAMERA = StereoCamera(
+    fu=430.0, fv=430.0, cu=370.0, cv=240.0, baseline_m=0.11, width=752, height=480
+)
+
+Lens = Callable[[FloatArray], FloatArray]  # of normalised pixels (N, 2)
+
+
+def _pixels(xy: FloatArray) -> FloatArray:
+    return xy * [CAMERA.fu, CAMERA.fv] + [CAMERA.cu, CAMERA.cv]
+
+
+def _radial(k1: float, k2: float = 0.0) -> Lens:
+    def distorted(xy: FloatArray) -> FloatArray:
+        squared = (xy**2).sum(axis=1, keepdims=True)
+        return xy * (1.0 + k1 * squared + k2 * squared**2)
+
+    return distorted
+
+
+def _turned(rotation: Sequence[float], focal: float = 1.0) -> Lens:
+    R = so3_exp(np.array(rotation))
+
+    def seen(xy: FloatArray) -> FloatArray:
+        rays = np.column_stack([xy, np.ones(len(xy))]) @ R.T
+        return focal * rays[:, :2] / rays[:, 2:]
+
+    return seen
+
+
+def _same(xy: FloatArray) -> FloatArray:
+    return xy
+
+
+def _frames(
+    left: Lens, right: Lens, count: int = 40, flat: bool = False, features: int = 150
+) -> list[Observations]:
+    """Frames of points at depths of 0.8 to 20 m, or on a wall, with wrong matches among them."""
+    rng = np.random.default_rng(3)
+    out = []
+    for k in range(count):
+        xy = rng.uniform([-0.8, -0.5], [0.8, 0.5], (features, 2))
+        disparity = CAMERA.baseline_m / (4.0 if flat else rng.uniform(0.8, 20.0, features))
+        z = np.hstack(
+            [_pixels(left(xy)), _pixels(right(xy - np.column_stack([disparity, 0.0 * disparity])))]
+        )
+        z += rng.normal(0.0, 0.2, z.shape)
+        wrong = rng.random(features) < 0.05
+        z[wrong, 3] += rng.uniform(-20.0, 20.0, int(wrong.sum()))
+        out.append(observations(k, k * 10**8, np.arange(features), z))
+    return out
+
+
+def _found(frames: Sequence[Observations]) -> list[Finding]:
+    check = LensCheck(CAMERA)
+    return [found for o in frames if (found := check.frame(o)) is not None]
+
+
+@pytest.mark.parametrize("k1", [-0.3, -0.1, 0.1])
+@pytest.mark.parametrize("rotation", [(0.0, 0.0, 0.0), (0.004, -0.003, 0.006)])
+def test_distortion_of_both_lenses_is_found_once(k1: float, rotation: Sequence[float]) -> None:
+    turned = _turned(rotation)
+    lens = _radial(k1)
+    (finding,) = _found(_frames(lens, lambda xy: turned(lens(xy)), 200))
+    assert (finding.code, finding.frame, finding.lasts) == ("other-calibration", 19, True)
+    assert finding.figures["distorted_share"] * k1 > 0.0
+
+
+HEALTHY: dict[str, tuple[Lens, Lens]] = {
+    "calibrated": (_same, _same),
+    "residual distortion": (_radial(0.02, -0.005), _radial(0.02, -0.005)),
+    "rolled": (_same, _turned((0.0, 0.0, 0.02))),
+    "pitched": (_same, _turned((0.02, 0.0, 0.0))),
+    "toed in": (_same, _turned((0.0, 0.02, 0.0))),
+    "another focal length": (_same, _turned((0.0, 0.0, 0.0), 1.02)),
+    "both at another focal length": (_turned((0, 0, 0), 1.05), _turned((0, 0, 0), 1.05)),
+}
+
+
+@pytest.mark.parametrize("name", HEALTHY)
+def test_other_errors_of_a_calibration_are_none(name: str) -> None:
+    assert _found(_frames(*HEALTHY[name], count=200)) == []
+
+
+@pytest.mark.parametrize("name", HEALTHY)
+def test_nor_are_they_before_a_wall(name: str) -> None:
+    assert _found(_frames(*HEALTHY[name], count=200, flat=True)) == []
+
+
+def test_too_few_matches_tell_nothing() -> None:
+    lens = _radial(-0.3)
+    assert _found(_frames(lens, lens, features=8)) == []
+    assert _found(_frames(lens, lens, count=19)) == []
+
+
+def test_distortion_is_found_after_frames_without_matches() -> None:
+    lens = _radial(-0.1)
+    frames = _frames(lens, lens)
+    blind = [observations(o.frame_index, o.time_ns, [], np.zeros((0, 4))) for o in frames[:30]]
+    assert [f.frame for f in _found([*blind, *frames])] == [19]
+
+
+def test_what_is_kept_does_not_grow() -> None:
+    check = LensCheck(CAMERA)
+    for o in _frames(_same, _same, 500, features=20):
+        check.frame(o)
+        assert len(check._matches) <= 20
+    assert check.done

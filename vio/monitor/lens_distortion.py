@@ -1,0 +1,136 @@
+"""Whether rectified pixels still have the distortion of the lenses, or one too much taken out.
+
+Raw images under a rectified calibration, and rectified ones under a raw one, move both pixels of a
+point by a share of their squared distances from the principal point. As left and right pixels lie
+at other distances, the rows of a near point differ from those of a far one beside it: by
+`k1 y (xr^2 - x^2)`, for the normalised pixels `x, y` and `xr` (equation (R2) of docs/math.md). No
+turn, shift or focal length of a camera does that.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vio.cameras.rectification_error import vertical_disparity_terms
+from vio.findings import Finding
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Tolerance
+from vio.numerics.robust import cauchy_equations, jackknife, median
+from vio.records import Observations
+
+
+class _LensRules(NamedTuple):
+    """When pixels are distorted."""
+
+    # frames with matches, after which it is asked
+    looked_at: tuple[int, ...] = (20, 40, 80, 160)
+    most: int = 20  # whose matches are kept, spread over all so far
+    blocks: Tolerance[int] = 5  # of matches in a row, each of which is left out once
+    min_matches: int = 400
+    sigmas: float = 6.0  # beyond which it is known
+    # Share of its distance from the principal point by which a pixel moves where that squared is half
+    # the corners'. Healthy recordings have up to .014, of KITTI's own rectification.
+    min_share: float = 0.03
+    steps: Tolerance[int] = 10  # of the robust fit, and of each that leaves a block out
+    further_steps: Tolerance[int] = 5
+    least_px: float = 0.1  # width of a row's error, at least
+
+
+_LENS = _LensRules()
+_RIDGE = 1e-9  # of terms that a scene does not show
+_CODE = "other-calibration"
+
+
+class LensCheck:
+    """Asks after some frames of a run whether their pixels are distorted."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        """Begin, with the rectified pair."""
+        self._camera = camera
+        self._matches: list[FloatArray] = []  # of every so many-th frame
+        self._every = 1
+        self._frames = 0
+        width = camera.width or 2.0 * camera.cu
+        height = camera.height or 2.0 * camera.cv
+        corner = (0.5 * width / camera.fu) ** 2 + (0.5 * height / camera.fv) ** 2
+        self._squares = np.array([0.5 * corner, (0.5 * corner) ** 2])  # of the radius: r^2, r^4
+
+    @property
+    def done(self) -> bool:
+        """Whether it is not asked any more."""
+        return self._frames >= _LENS.looked_at[-1]
+
+    def frame(self, seen: Observations) -> Finding | None:
+        """Return the finding after a frame."""
+        matches = seen.z[seen.has_right]
+        if self.done or not len(matches):
+            return None
+        if self._frames % self._every == 0:
+            self._matches.append(matches)
+        self._frames += 1
+        if len(self._matches) > _LENS.most:
+            del self._matches[1::2]
+            self._every *= 2
+        if self._frames not in _LENS.looked_at:
+            return None
+        found = self._share()
+        if found is None:
+            return None
+        share, sigma = found
+        if abs(share) <= max(_LENS.min_share, _LENS.sigmas * sigma):
+            return None
+        self._frames = _LENS.looked_at[-1]
+        index = seen.frame_index
+        message = (
+            f"frame {index}: rows of near and far points differ as lens distortion makes them, by "
+            f"{100 * abs(share):.0f} % of a pixel's way from the middle: raw images were given with a "
+            "rectified calibration, rectified ones with a raw one, or the lenses are others; give the "
+            "calibration of these images"
+        )
+        figures = {"distorted_share": share, "distorted_share_sigma": sigma}
+        return Finding(_CODE, message, index, 0, lasts=True, figures=figures)
+
+    def _share(self) -> tuple[float, float] | None:
+        """By which share of its distance from the principal point a pixel is off where that squared
+        is half the corners', and the standard error; None: too few matches.
+        """
+        if sum(map(len, self._matches)) < _LENS.min_matches:
+            return None
+        z = np.concatenate(self._matches)
+        terms = self._terms(z)
+        rows = (z[:, 3] - z[:, 1]) / self._camera.fv
+        least = _LENS.least_px / self._camera.fv
+        start = np.zeros(terms.shape[1])
+        start[2] = median(rows)
+        whole = _robust_fit(terms, rows, least, start, _LENS.steps)
+        block = np.arange(len(z)) * _LENS.blocks // len(z)
+        without = [
+            _robust_fit(terms[block != k], rows[block != k], least, whole, _LENS.further_steps)
+            for k in range(_LENS.blocks)
+        ]
+        sigma = jackknife(np.array(without)[:, :2] @ self._squares)
+        return float(self._squares @ whole[:2]), float(sigma)
+
+    def _terms(self, z: FloatArray) -> FloatArray:
+        """The terms (N, 13) of rows, those of k1 and k2 first: then those of (R2), the cubic ones of
+        lenses that differ, and tangential distortion.
+        """
+        rows, common = vertical_disparity_terms(self._camera, z)
+        x = (z[:, 0] - self._camera.cu) / self._camera.fu
+        y = (z[:, 1] - self._camera.cv) / self._camera.fv
+        return np.column_stack([common[:, :2], rows, x * x * y, y**3, common[:, 2:]])
+
+
+def _robust_fit(
+    terms: FloatArray, rows: FloatArray, least: float, start: FloatArray, steps: int
+) -> FloatArray:
+    """The coefficients (13,) that most rows (N,) agree with, from others on; terms (N, 13)."""
+    x = start.copy()
+    for _ in range(steps):
+        residual = (rows - terms @ x)[:, None]
+        equations = cauchy_equations(residual, terms[:, None, :], least)
+        x += np.linalg.solve(equations.matrix + _RIDGE * np.eye(len(x)), equations.vector)
+    return x
