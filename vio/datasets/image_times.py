@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.dates import dates_in_names
 from vio.datasets.frame_times import PAIRED_NS, nearest, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImagePairs
@@ -24,6 +23,7 @@ from vio.datasets.sides import without_side
 from vio.datasets.tables import drive_times, is_date, table_rows
 from vio.datasets.unused import Layout
 from vio.errors import DataError
+from vio.files.dates import dates_in_names
 from vio.files.stamps import FRAME_PACE, check_digits, parse_stamps
 from vio.files.text import text_lines
 from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
