@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.io import savemat
 
 import vio
 from vio.cameras.rig import Rig
@@ -663,6 +664,68 @@ def spectacular(folder: Path, model: DistortionModel = "radtan") -> Path:
     return _save(folder, "calibration.json", json.dumps({"cameras": cameras}))
 
 
+_FIRST_PIXEL = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])  # is (1, 1) in MATLAB
+
+
+def _of_matlab(rig: Rig, unit: str) -> dict[str, object]:
+    """What `toStruct` makes of `stereoParameters`: rows times matrices, and the first pixel is (1, 1)."""
+    factor = {"millimeters": 1e3, "m": 1.0}[unit]
+    cameras: dict[str, object] = {}
+    for k, c in enumerate(rig.cameras, start=1):
+        cameras[f"CameraParameters{k}"] = {
+            "RadialDistortion": np.array(c.coefficients[:2]),
+            "TangentialDistortion": np.array(c.coefficients[2:4]),
+            "ImageSize": np.array([c.height, c.width], dtype=np.float64),
+            "WorldUnits": unit,
+            "IntrinsicMatrix": (c.K + _FIRST_PIXEL).T,
+            "Version": {"Major": 1.0, "Minor": 3.0},
+        }
+    pose = {
+        "RotationOfCamera2": T_CAM1_CAM0[:3, :3].T,
+        "TranslationOfCamera2": factor * T_CAM1_CAM0[:3, 3],
+    }
+    return {**cameras, **pose}
+
+
+def matlab(folder: Path, unit: str = "millimeters") -> Path:
+    """`save('stereo.mat', 's', '-v7')` of that structure."""
+    savemat(folder / "stereo.mat", {"s": _of_matlab(true_rig(), unit)})
+    return folder / "stereo.mat"
+
+
+def matlab_json(folder: Path) -> Path:
+    """`jsonencode(stereoParams)` of MATLAB R2022b or later, with columns times matrices."""
+    rig = true_rig()
+    entries: dict[str, object] = {}
+    for k, c in enumerate(rig.cameras, start=1):
+        entries[f"CameraParameters{k}"] = {
+            "K": (c.K + _FIRST_PIXEL).tolist(),
+            "RadialDistortion": list(c.coefficients[:2]),
+            "TangentialDistortion": list(c.coefficients[2:4]),
+            "ImageSize": [c.height, c.width],
+        }
+    R, t = T_CAM1_CAM0[:3, :3], 1e3 * T_CAM1_CAM0[:3, 3]
+    entries |= {"PoseCamera2": {"R": R.tolist(), "Translation": t.tolist()}, "WorldUnits": "mm"}
+    return _save(folder, "stereo.json", json.dumps(entries))
+
+
+def bouguet(folder: Path) -> Path:
+    """The results of Bouguet's toolbox."""
+    rig = true_rig()
+    found: dict[str, object] = {"R": T_CAM1_CAM0[:3, :3], "T": 1e3 * T_CAM1_CAM0[:3, 3:]}
+    for side, c in zip(("left", "right"), rig.cameras, strict=True):
+        found |= {
+            f"fc_{side}": np.array([[c.fu], [c.fv]]),
+            f"cc_{side}": np.array([[c.cu], [c.cv]]),
+            f"alpha_c_{side}": 0.0,
+            f"kc_{side}": np.array([[*c.coefficients, 0.0]]).T,
+        }
+    savemat(
+        folder / "Calib_Results_stereo.mat", {**found, "nx": 1280.0, "ny": 720.0, "om": np.zeros(3)}
+    )
+    return folder / "Calib_Results_stereo.mat"
+
+
 def _kitti(folder: Path) -> Path:
     c = rectified_rig().cam0
     P0 = np.column_stack([c.K, np.zeros(3)])
@@ -707,7 +770,13 @@ _NO_SHIFT = replace(true_rig(), time_offset_s=0.0)
 FORMS = (
     Form("Kalibr", "`camchain-imucam.yaml`", kalibr, _NO_NOISE),
     *(
-        Form("Kalibr", f"likewise, `{name}`", partial(kalibr, model=model), replace(true_rig(model), imu_noise=None))
+        Form(
+            "Kalibr",
+            f"likewise, `{name}`",
+            partial(kalibr, model=model),
+            replace(true_rig(model), imu_noise=None),
+            row=False,
+        )
         for name, model in _OF_KALIBR.items()
     ),
     Form("OpenVINS", "`kalibr_imucam_chain.yaml` with `T_imu_cam`", openvins, true_rig()),
@@ -717,6 +786,7 @@ FORMS = (
         "`File.version`, `KannalaBrandt8`",
         lambda f: orbslam3("equidistant", f),
         replace(true_rig("equidistant"), time_offset_s=0.0),
+        row=False,
     ),
     Form("ORB-SLAM3", "`File.version`, `Rectified`", orbslam3_rectified, rectified_rig()),
     Form("ORB-SLAM2, 3", "`LEFT.K` … `RIGHT.P`, `Tbc`", orbslam_old, _NO_SHIFT),
@@ -741,18 +811,20 @@ FORMS = (
         "likewise, `MEI`",
         lambda f: vins("unified", f),
         replace(true_rig("unified"), imu_noise=None),
+        row=False,
     ),
     Form(
         "VINS-Fusion",
         "likewise, `KANNALA_BRANDT`",
         lambda f: vins("equidistant", f),
         replace(true_rig("equidistant"), imu_noise=None),
+        row=False,
     ),
     Form("Basalt", "`calibration.json`, `ds`", lambda f: basalt("double_sphere", f), true_rig("double_sphere")),
-    Form("Basalt", "likewise, `kb4`", lambda f: basalt("equidistant", f), true_rig("equidistant")),
-    Form("Basalt", "likewise, `eucm`", lambda f: basalt("eucm", f), true_rig("eucm")),
+    Form("Basalt", "likewise, `kb4`", lambda f: basalt("equidistant", f), true_rig("equidistant"), row=False),
+    Form("Basalt", "likewise, `eucm`", lambda f: basalt("eucm", f), true_rig("eucm"), row=False),
     Form("Basalt", "likewise, `ucm`", basalt_ucm, one_centre(), row=False),
-    Form("Basalt", "likewise, `fov`", lambda f: basalt("fov", f), true_rig("fov")),
+    Form("Basalt", "likewise, `fov`", lambda f: basalt("fov", f), true_rig("fov"), row=False),
     Form(
         "DepthAI",
         "JSON of an OAK, linked through the colour camera",
@@ -772,7 +844,7 @@ FORMS = (
         replace(true_rig("equidistant"), imu_noise=None, time_offset_s=0.0),
         row=False,
     ),
-    Form("DepthAI", "likewise, `cameraType` 3", lambda f: depthai_of(f, 3), None),
+    Form("DepthAI", "likewise, `cameraType` 3", lambda f: depthai_of(f, 3), None, row=False),
     Form("cuVSLAM", "`stereo.edex`", lambda f: edex(f, true_rig(), "brown"), imu_free(true_rig())),
     Form(
         "cuVSLAM",
@@ -819,7 +891,7 @@ FORMS = (
         row=False,
     ),
     Form("ZED", "`SN*.conf`", zed, imu_free(true_rig()), SIZE),
-    Form("ZED", "`SN*.conf` with `LEFT_DISTO`, fisheye", zed_x, imu_free(true_rig("equidistant")), SIZE),
+    Form("ZED", "`SN*.conf` with `LEFT_DISTO`, fisheye", zed_x, imu_free(true_rig("equidistant")), SIZE, row=False),
     Form("ZED", "`SN*.conf`, images of another size", zed, None, (640, 480)),
     Form("OKVIS, OKVIS2", "`cameras:` with `T_SC`", okvis, true_rig()),
     Form("OKVIS2", "likewise, `cam_model: eucm`", okvis2_eucm, true_rig("eucm"), row=False),
@@ -832,12 +904,16 @@ FORMS = (
         replace(true_rig(), imu_noise=None, time_offset_s=0.0),
     ),
     Form("Kimera", "`LeftCameraParams.yaml`, `ImuParams.yaml`", kimera, true_rig()),
-    Form("4Seasons", "`undistorted_calib_*.txt`", four_seasons, imu_free(rectified_rig())),
+    Form("4Seasons", "`undistorted_calib_*.txt`", four_seasons, imu_free(rectified_rig()), row=False),
     Form("OpenCV", "`M1 D1 M2 D2 R T`, size stated", lambda f: _opencv(f, 1.0, sized=True), imu_free(true_rig())),
     Form("OpenCV", "likewise, T in squares of the board", lambda f: _opencv(f, 40.0, sized=True), _LONGER),
     Form("OpenCV", "likewise, no size, images of half of it", lambda f: _opencv(f, 1.0, sized=False), None, (640, 360)),
     Form("OpenCV", "`omnidir`: `xi_1`, `rvec`, `tvec`", opencv_omnidir, imu_free(true_rig("unified"))),
     Form("OpenCV", "distortion by an unknown name", _opencv_other_names, None, row=False),
+    Form("MATLAB", "`stereoParameters` as a structure, `.mat`", matlab, imu_free(true_rig())),
+    Form("MATLAB", "likewise, JSON of R2022b", matlab_json, imu_free(true_rig()), row=False),
+    Form("MATLAB", "likewise, in metres", lambda f: matlab(f, "m"), imu_free(true_rig()), row=False),
+    Form("Bouguet's toolbox", "`Calib_Results_stereo.mat`", bouguet, imu_free(true_rig())),
     Form("KITTI", "`calib.txt`", _kitti, imu_free(rectified_rig()), SIZE),
     Form("KITTI", "`calib.txt`, images of 0.6 of its size", _kitti, None, (768, 432)),
     Form("BoofCV", "`stereo.yaml`", lambda f: _boofcv(f, 1.0), imu_free(true_rig())),

@@ -71,7 +71,7 @@ def test_what_takes_the_place_of_another_thing_is_named(
     for beside in (other, other.parent):
         assert "no known recording" in refused(capsys, "inspect", beside)
     shutil.rmtree(other.parent)
-    assert "is a folder; give a file of poses" in refused(
+    assert "is a folder; give one file of all poses" in refused(
         capsys, "run", flight, "--reference", flight, "--out", tmp_path / "out"
     )
     assert "is a map of vio run, which is not read; give the recording" in refused(

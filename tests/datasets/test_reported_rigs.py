@@ -9,9 +9,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
+from scipy.io import savemat
 
 import vio
 from tests import calibration_forms as forms
@@ -21,7 +23,7 @@ from vio.datasets.rigs.camera_info import CameraInfo, rig_from_camera_infos
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.rigs.source import stereo_pose_on_imu
 from vio.datasets.unused import Layout, unused_note
-from vio.errors import CalibrationError
+from vio.errors import CalibrationError, DataError
 
 
 def _doubts(rig: Rig) -> list[str]:
@@ -419,3 +421,163 @@ def test_a_transposed_matrix_is_called_so(tmp_path: Path) -> None:
     np.savez(tmp_path / "stereo.npz", **{**matrices, "mtxL": matrices["mtxL"].T})
     with pytest.raises(CalibrationError, match="it is transposed, as MATLAB has it"):
         vio.load_rig(tmp_path / "stereo.npz", image_size=SIZE)
+
+
+# --- MATLAB, messages of ROS, and settings that name a calibration
+
+
+def _matlab(folder: Path, **changes: object) -> Path:
+    file = forms.matlab_json(folder)
+    entries = json.loads(file.read_text())
+    for name, value in changes.items():
+        for place in (entries, entries["CameraParameters1"]):
+            if name in place:
+                place[name] = value
+    file.write_text(json.dumps(entries))
+    return file
+
+
+def test_the_first_pixel_of_matlab_is_one(tmp_path: Path) -> None:
+    K = json.loads(forms.matlab_json(tmp_path).read_text())["CameraParameters1"]["K"]
+    assert vio.load_rig(tmp_path / "stereo.json").cam0.cu == pytest.approx(K[0][2] - 1)
+
+
+def test_a_board_in_metres_that_matlab_calls_millimetres_is_doubted(tmp_path: Path) -> None:
+    pose = {"R": T_CAM1_CAM0[:3, :3].tolist(), "Translation": T_CAM1_CAM0[:3, 3].tolist()}
+    (doubt,) = _doubts(vio.load_rig(_matlab(tmp_path, PoseCamera2=pose)))
+    assert "which puts the cameras 0.00011 m apart" in doubt
+    assert not _doubts(vio.load_rig(_matlab(tmp_path)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"WorldUnits": "inches"}, "states lengths in 'inches', which is not read"),
+        ({"K": [[700, 3, 640], [0, 700, 360], [0, 0, 1]]}, "has a skew of 3 px"),
+        ({"CameraParameters2": 3}, "has no block 'CameraParameters2:'"),
+        ({"PoseCamera2": 3}, "RotationOfCamera2 holds 1 values, expected 3 x 3"),
+    ],
+)
+def test_matlab_files_that_are_not_read_say_why(
+    changes: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        vio.load_rig(_matlab(tmp_path, **changes))
+
+
+def test_other_files_of_matlab_are_no_calibration(tmp_path: Path) -> None:
+    savemat(tmp_path / "stereo.mat", {"a": np.eye(3)})
+    with pytest.raises(CalibrationError, match="is no calibration of a known format"):
+        vio.load_rig(tmp_path / "stereo.mat")
+    with pytest.raises(CalibrationError, match="holds no calibration"):
+        vio.load_rig(tmp_path)
+    forms.matlab(tmp_path)
+    assert vio.load_rig(tmp_path).cam0.width == SIZE[0]
+
+
+def test_objects_of_matlab_are_named(tmp_path: Path) -> None:
+    file = forms.matlab(tmp_path)
+    held = "scipy.io.whosmat"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            held,
+            lambda _: [("None", (1, 1), "opaque"), ("__function_workspace__", (1, 9), "uint8")],
+        )
+        with pytest.raises(DataError, match=r"toStruct\(stereoParams\)"):
+            vio.load_rig(file)
+
+
+def _message(camera: int, old: bool) -> str:
+    rig = forms.true_rig()
+    c = rig.cameras[camera]
+    R0, R1, P0, P1 = cv2.stereoRectify(
+        rig.cam0.K, np.array(rig.cam0.coefficients), rig.right[0].K, np.array(rig.right[0].coefficients),
+        SIZE, T_CAM1_CAM0[:3, :3], T_CAM1_CAM0[:3, 3], flags=cv2.CALIB_ZERO_DISPARITY,
+    )[:4]  # fmt: skip
+    R, P = ((R0, P0), (R1, P1))[camera]
+    names = "DKRP" if old else "dkrp"
+    matrices = zip(names, ([*c.coefficients, 0.0], c.K, R, P), strict=True)
+    head = {"height": SIZE[1], "width": SIZE[0], "distortion_model": "plumb_bob"}
+    body = {**head, **{name: np.ravel(m).tolist() for name, m in matrices}}
+    stamp = (
+        "header: \n  stamp: \n    secs: 1\n    nsecs: 2\n"
+        if old
+        else "header:\n  stamp:\n    sec: 1\n"
+    )
+    return f"{stamp}{yaml.safe_dump(body)}---\n"
+
+
+@pytest.mark.parametrize("old", [True, False], ids=["ROS 1", "ROS 2"])
+@pytest.mark.parametrize("messages", [1, 3])
+def test_messages_as_ros_prints_them_are_read(old: bool, messages: int, tmp_path: Path) -> None:
+    for k, side in enumerate(("left", "right")):
+        (tmp_path / f"{side}.yaml").write_text(messages * _message(k, old))
+    rig = vio.load_rig(tmp_path)
+    np.testing.assert_allclose(rig.right[1], T_CAM1_CAM0, atol=1e-9)
+    assert rig.cam0.fu == pytest.approx(forms.true_rig().cam0.fu)
+
+
+def test_two_documents_in_a_file_are_no_calibration(tmp_path: Path) -> None:
+    file = tmp_path / "left.yaml"
+    file.write_text(_message(0, True) + "other: 1\n")
+    with pytest.raises(CalibrationError, match="expected a single document"):
+        vio.load_rig(file)
+
+
+def test_settings_of_openvins_name_their_camchain(tmp_path: Path) -> None:
+    forms.openvins(tmp_path)
+    settings = tmp_path / "estimator_config.yaml"
+    settings.write_text(
+        '%YAML:1.0\nuse_stereo: true\nrelative_config_imu: "kalibr_imu_chain.yaml"\n'
+        'relative_config_imucam: "kalibr_imucam_chain.yaml"\n'
+    )
+    rig = vio.load_rig(settings)
+    np.testing.assert_allclose(rig.right[1], T_CAM1_CAM0, atol=1e-9)
+    assert rig.T_cam0_imu is not None
+    assert vio.load_rig(settings, cameras=1).cameras == rig.cameras[:1]
+
+
+def test_matrices_in_a_block_for_each_camera_are_read(tmp_path: Path) -> None:
+    rig = forms.true_rig()
+    blocks = {
+        side: {"K": c.K.tolist(), "D": list(c.coefficients)}
+        for side, c in zip(("left", "right"), rig.cameras, strict=True)
+    }
+    pose = {"R": T_CAM1_CAM0[:3, :3].tolist(), "T": T_CAM1_CAM0[:3, 3].tolist()}
+    (tmp_path / "rig.json").write_text(json.dumps({**blocks, **pose}))
+    read = vio.load_rig(tmp_path / "rig.json", image_size=SIZE)
+    np.testing.assert_allclose(read.right[1], T_CAM1_CAM0, atol=1e-12)
+    assert read.cameras == rig.cameras
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (
+            "ost.txt",
+            "# oST version 5.0 parameters\n\n[image]\n\nwidth\n640\n",
+            "give the left.yaml and right",
+        ),
+        (
+            "cameras.txt",
+            "# Camera list with one line of data per camera:\n1 PINHOLE 640 480 1 1 1 1\n",
+            "COLMAP",
+        ),
+        (
+            "aprilgrid.yaml",
+            "target_type: aprilgrid\ntagCols: 6\n",
+            "describes a board to calibrate with",
+        ),
+        (
+            "imu.yaml",
+            "gyroscope_noise_density: 0.001\nupdate_rate: 200\n",
+            "describes an IMU alone",
+        ),
+    ],
+)
+def test_files_beside_a_calibration_are_called_what_they_are(
+    name: str, text: str, message: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(CalibrationError, match=message):
+        vio.load_rig(tmp_path / name, image_size=SIZE)

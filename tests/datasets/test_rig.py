@@ -818,7 +818,7 @@ BAD = {
     ),
     "notes as .txt": (
         _text("notes.txt", "fx=458 b=0.11\n"),
-        "and KITTI's calib.txt has one; give that file",
+        "notes.txt: is no calibration of a known format",
     ),
     "OpenCV without T": (_storage(T=None, R2=None), "has no T, the pose of the right camera"),
     "OpenCV with a rotation vector": (_storage(R=np.zeros((3, 1))), "R holds 3 numbers"),

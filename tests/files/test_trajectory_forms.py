@@ -578,3 +578,126 @@ def test_an_order_that_is_assumed_is_named_where_poses_are_converted(
     written = convert_trajectory(file, tmp_path / "poses.tum", "tum")
     np.testing.assert_allclose(written.T_world_body, TRUTH.T_world_body, atol=1e-12)
     assert ("does not state the order of its quaternions" in caplog.text) is (header == "")
+
+
+# --- stamps in two columns, as dates, or in names of images
+
+
+def _split(separator: str, names: tuple[str, ...] = ()) -> list[str]:
+    return [separator.join((str(t // 10**9), str(t % 10**9), *names)) for t in TIMES_NS.tolist()]
+
+
+@pytest.mark.parametrize("names", [("map",), ("odom", "base_link"), ("",)])
+def test_poses_as_ros2_topic_echo_writes_them_are_read(
+    names: tuple[str, ...], tmp_path: Path
+) -> None:
+    covariance = np.zeros((COUNT, 36))
+    for columns in (XYZW, [*XYZW, covariance]):
+        file = _write(tmp_path / "odom.csv", "", _split(",", names), columns, ",")
+        read = read_trajectory(file)
+        np.testing.assert_array_equal(read.times_ns, TIMES_NS)
+        np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body, atol=1e-12)
+        assert read.orientations == "stated"
+
+
+def test_points_as_ros2_topic_echo_writes_them_are_positions(tmp_path: Path) -> None:
+    read = read_trajectory(_write(tmp_path / "p.csv", "", _split(",", ("map",)), [P], ","))
+    np.testing.assert_array_equal(read.times_ns, TIMES_NS)
+    np.testing.assert_array_equal(read.positions, P)
+    assert read.orientations == "none"
+
+
+@pytest.mark.parametrize(("separator", "columns"), [(" ", XYZW), (",", WXYZ)])
+def test_seconds_and_nanoseconds_without_a_header_are_one_time(
+    separator: str, columns: list[FloatArray], tmp_path: Path
+) -> None:
+    read = read_trajectory(_write(tmp_path / "p", "", _split(separator), columns, separator))
+    np.testing.assert_array_equal(read.times_ns, TIMES_NS)
+    np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+def test_two_whole_numbers_that_are_no_clock_are_not_joined(tmp_path: Path) -> None:
+    back = [text.replace("1700000003 ", "1700000001 ") for text in _split(" ")]
+    small = [f"{k} {k % 7}" for k in range(COUNT)]
+    for stamps in (back, small):
+        with pytest.raises(DataError, match="9 columns fit no known format"):
+            read_trajectory(_write(tmp_path / "p", "", stamps, XYZW))
+
+
+@pytest.mark.parametrize(
+    ("form", "separator", "header"),
+    [
+        ("{}T{}Z", " ", ""),
+        ("{} {}", " ", ""),
+        ("{} {}", ",", "time,x,y,z,qx,qy,qz,qw"),
+        ("{}T{}", ",", ""),
+    ],
+)
+def test_dates_of_poses_are_read(form: str, separator: str, header: str, tmp_path: Path) -> None:
+    dates = [str(np.datetime64(t, "ns")).split("T") for t in TIMES_NS.tolist()]
+    stamps = [form.format(*date) for date in dates]
+    columns = XYZW if header or separator == " " else WXYZ
+    file = _write(tmp_path / "poses.txt", header, stamps, columns, separator)
+    read = read_trajectory(file)
+    np.testing.assert_array_equal(read.times_ns, TIMES_NS)
+    np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body, atol=1e-12)
+    assert is_trajectory_file(file)
+    file.write_text(file.read_text().replace("2023-11-14", "2023-13-14"))
+    with pytest.raises(DataError):
+        read_trajectory(file)
+
+
+@pytest.mark.parametrize("columns", [13, 17])
+def test_matrices_between_commas_are_read(columns: int, tmp_path: Path) -> None:
+    rows = TRUTH.T_world_body[:, : 3 if columns == 13 else 4].reshape(COUNT, -1)
+    read = read_trajectory(_write(tmp_path / "global_pose.csv", "", NS, [rows], ","))
+    np.testing.assert_array_equal(read.times_ns, TIMES_NS)
+    np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+def test_truth_of_euroc_without_its_header_is_no_matrix(tmp_path: Path) -> None:
+    others = np.zeros((COUNT, 9))
+    read = read_trajectory(_write(tmp_path / "data.csv", "", NS, [*WXYZ, others], ","))
+    np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+ANGLES = np.tile([10.0, 20.0, 30.0], (COUNT, 1))
+PHOTOGRAMMETRY = [
+    ("#PhotoID, X, Y, Z, Omega, Phi, Kappa, r11, r12, r13, r21, r22, r23, r31, r32, r33", "\t",
+     [P, ANGLES, TRUTH.T_world_body[:, :3, :3].reshape(COUNT, 9)]),
+    ("#Label,X/East,Y/North,Z/Altitude,Yaw,Pitch,Roll,Error_(m)", ",", [P, ANGLES, ANGLES[:, :1]]),
+    ("#name,x,y,alt,heading,pitch,roll", ",", [P, ANGLES]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("header", "separator", "columns"), PHOTOGRAMMETRY)
+def test_positions_of_photogrammetry_have_the_times_of_their_images(
+    header: str, separator: str, columns: list[FloatArray], tmp_path: Path
+) -> None:
+    names = [f"{t}.png" for t in NS]
+    read = read_trajectory(_write(tmp_path / "cameras.txt", header, names, columns, separator))
+    np.testing.assert_array_equal(read.times_ns, TIMES_NS)
+    np.testing.assert_array_equal(read.positions, P)
+    assert read.orientations == "none"
+    for name in ("IMG_{:04d}.JPG", "{:06d}.png"):
+        names = [name.format(k) for k in range(COUNT)]
+        file = _write(tmp_path / "cameras.txt", header, names, columns, separator)
+        with pytest.raises(DataError, match=r"names of images .* which are no times"):
+            read_trajectory(file)
+
+
+def test_degrees_beside_the_letter_of_an_axis_are_no_metres(tmp_path: Path) -> None:
+    header = "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll"
+    file = _write(tmp_path / "reference.csv", header, [f"{t}.png" for t in NS], [P, ANGLES], ",")
+    with pytest.raises(DataError, match="names latitude and longitude"):
+        read_trajectory(file)
+
+
+@pytest.mark.parametrize("name", ["frame", "Index", "image_id"])
+def test_numbers_of_frames_are_no_times(name: str, tmp_path: Path) -> None:
+    header = f"{name},x,y,z,qx,qy,qz,qw"
+    numbers = [str(k + 1) for k in range(COUNT)]
+    with pytest.raises(DataError, match=f"its column '{name}' numbers frames"):
+        read_trajectory(_write(tmp_path / "blender.csv", header, numbers, XYZW, ","))
+    read = read_trajectory(_write(tmp_path / "blender.csv", header, SECONDS, XYZW, ","))
+    np.testing.assert_array_equal(read.times_ns, TIMES_NS)

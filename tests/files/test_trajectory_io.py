@@ -336,7 +336,7 @@ def test_rejects_bad_trajectory_files_with_one_line_error(tmp_path: Path, name: 
 def test_rejects_missing_folder_and_binary_files(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"cannot read .*missing\.txt: No such file"):
         read_trajectory(tmp_path / "missing.txt")
-    with pytest.raises(DataError, match=r"is a folder; give a file of poses"):
+    with pytest.raises(DataError, match=r"is a folder; give one file of all poses"):
         read_trajectory(tmp_path)
     (tmp_path / "b").write_bytes(b"\x89PNG\xff\xfe\x00")
     with pytest.raises(DataError, match="b: not a text file"):

@@ -188,6 +188,24 @@ def test_association_by_time_pairs_what_evo_pairs() -> None:
     assert 20 < len(rows) < 50
 
 
+@pytest.mark.parametrize(
+    ("step_ns", "mode", "count"),
+    [(100_000_000, "frame", 40), (104_000_000, "time", 40), (99_000_000, "time", 7)],
+)
+def test_assumed_times_are_those_of_no_clock(step_ns: int, mode: str, count: int) -> None:
+    frames = np.arange(40)
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    reference = Trajectory(poses, 104_000_000 * frames, "cam0", frames)
+    estimate = Trajectory(poses, step_ns * frames, "cam0", frames)
+    found, rows, reference_rows = associate(estimate, reference)
+    assert (found, len(rows)) == (mode, count)
+    if mode == "frame":
+        np.testing.assert_array_equal(rows, reference_rows)
+    # a reference without numbers has times alone
+    alone = Trajectory(poses, reference.times_ns, "cam0")
+    assert associate(estimate, alone)[0] == "time"
+
+
 # The KITTI metric
 
 

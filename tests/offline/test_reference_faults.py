@@ -328,3 +328,36 @@ def test_a_body_that_stands_at_its_start_has_no_placeholders() -> None:
     poses[:7] = poses[7]
     standing = replace(whole, T_world_body=poses)
     assert not [n for n in evaluate(standing, standing).notes if "placeholders" in n]
+
+
+# --- a reference that jumps
+
+
+def _jumping(first: int, last: int, by_m: float) -> Trajectory:
+    truth = _trajectory()
+    poses = truth.T_world_body.copy()
+    poses[first:last, :3, 3] += np.array([by_m, -0.4 * by_m, 0.1 * by_m])
+    return replace(truth, T_world_body=poses)
+
+
+@pytest.mark.parametrize(("last", "count"), [(260, "2 times"), (COUNT, "1 time")])
+@pytest.mark.parametrize("by_m", [0.5, 8.0])
+def test_a_reference_that_jumps_is_named(last: int, count: str, by_m: float) -> None:
+    notes = evaluate(_odometry(1.01, 0.0, 0.005), _jumping(150, last, by_m)).notes
+    (note,) = [note for note in notes if "jumps" in note]
+    assert f"the reference jumps {count} by up to" in note
+    assert f"first at pose 151 of {COUNT}" in note
+    assert not [note for note in notes if "clock" in note]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_other_errors_are_no_jumps(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    estimate = _odometry(1.0 + 0.03 * rng.standard_normal(), 0.01 * rng.standard_normal(), 0.1)
+    noisy = _trajectory().T_world_body.copy()
+    noisy[:, :3, 3] += 0.01 * rng.standard_normal((COUNT, 3))
+    truth = replace(_trajectory(), T_world_body=noisy)
+    # the estimate's own jump is no fault of the reference
+    jumped = replace(estimate, T_world_body=_jumping(200, 300, 0.5).T_world_body)
+    for case in (estimate, jumped):
+        assert not [note for note in evaluate(case, truth).notes if "jumps" in note]

@@ -19,11 +19,11 @@ import numpy as np
 
 from vio.datasets.common import naming
 from vio.datasets.features import FeatureDataset
-from vio.datasets.kitti import DRIVE_NS
 from vio.datasets.reader import Reader
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import refuse_swapped
 from vio.errors import CalibrationError, DataError
+from vio.files.stamps import ASSUMED_STEP_NS
 from vio.files.text import read_numbers
 from vio.geometry.lie import FloatArray, nearest_rotation, rigid_fault, se3_from_parts
 from vio.geometry.stereo import StereoCamera
@@ -68,7 +68,7 @@ def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDa
         offsets, ids[order], z, np.ones(rows, dtype=np.bool_), np.zeros(rows, dtype=np.bool_)
     )
     refuse_swapped(tracks, file)
-    times_ns: IntArray = (numbers - numbers[0]) * DRIVE_NS
+    times_ns: IntArray = (numbers - numbers[0]) * ASSUMED_STEP_NS
     poses_file = _beside(file, "camera_poses")
     reference = None
     if poses_file is not None:
@@ -83,7 +83,7 @@ def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDa
         motion=frozenset(),
         reference=reference,
         notes=(
-            f"{file.name} states no times; frames are taken to be {DRIVE_NS * 1e-9:g} s apart, so "
+            f"{file.name} states no times; frames are taken to be {ASSUMED_STEP_NS * 1e-9:g} s apart, so "
             "speeds are unknown",
             f"not used: the points X Y Z of {file.name}",
         ),

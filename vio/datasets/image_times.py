@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.dates import dates_in_names
 from vio.datasets.frame_times import PAIRED_NS, nearest, pair_stamps
 from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImagePairs
@@ -24,7 +23,8 @@ from vio.datasets.sides import without_side
 from vio.datasets.tables import drive_times, is_date, table_rows
 from vio.datasets.unused import Layout
 from vio.errors import DataError
-from vio.files.stamps import FRAME_PACE, check_digits, parse_stamps
+from vio.files.dates import dates_in_names
+from vio.files.stamps import ASSUMED_STEP_NS, FRAME_PACE, check_digits, parse_stamps
 from vio.files.text import text_lines
 from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
 from vio.records import NS_PER_S, IntArray
@@ -32,7 +32,6 @@ from vio.records import NS_PER_S, IntArray
 _MIN_LEFT_OUT = 10  # numbers between the last image and the first one of such a recording
 _MIN_FULL = 999  # the largest number of a camera's counter has so many nines, or more
 TIME_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "left_images.txt")
-_ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 _LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
 _TIMED = 100  # images, of which names that are times show it
 _LIST_FORM = "timestamp [ns], filename"
@@ -346,10 +345,10 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
     holes = int(counts[-1]) + 1 - len(counts)
     counted = f" (with the {holes} that the numbers leave out)" if holes else ""
     note = (
-        f"{layout.root}: no times.txt; frames{counted} are taken to be {1 / _ASSUMED_HZ:g} s apart, "
+        f"{layout.root}: no times.txt; frames{counted} are taken to be {ASSUMED_STEP_NS / NS_PER_S:g} s apart, "
         "so speeds are unknown; write one time an image (seconds or nanoseconds) into times.txt"
     )
-    return counts * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
+    return counts * ASSUMED_STEP_NS, None, (note,)
 
 
 def _left_files(pairs: ImagePairs) -> Sequence[Path]:

@@ -23,7 +23,6 @@ from vio.records import IntArray, VelocitySample
 
 # allowed offset of the right camera from the left one's x axis, as a share of the baseline
 RECTIFIED_SHARE = 0.02
-DRIVE_NS = 100_000_000  # between frames of a drive
 
 
 @dataclass(frozen=True, slots=True)

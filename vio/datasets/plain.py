@@ -54,7 +54,6 @@ from vio.datasets.image_times import (
     times_of,
 )
 from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_gray
-from vio.datasets.kitti import DRIVE_NS
 from vio.datasets.kitti_raw import CAMERAS, PERSPECTIVE, find_above
 from vio.datasets.lost_images import CountedApart, pairs_in_step
 from vio.datasets.reader import Reader
@@ -74,6 +73,7 @@ from vio.datasets.tum_rgbd import (
 )
 from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError
+from vio.files.stamps import ASSUMED_STEP_NS
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.records import Image, IntArray, Trajectory
@@ -423,7 +423,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> ImageDataset:
     if used[0].is_file():
         times_ns = drive_times(used[0], numbers)
     else:
-        times_ns = numbers * DRIVE_NS
+        times_ns = numbers * ASSUMED_STEP_NS
         notes = (f"{used[0]} is missing; times follow from the frame numbers at 10 Hz", *notes)
     times = (times_ns, used[0])
     read = ReadImages("kitti_raw", layout, (file, rig), times, notes, used, numbers=numbers)

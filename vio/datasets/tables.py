@@ -18,9 +18,9 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.datasets.common import check_gravity_column
-from vio.datasets.dates import date_ns, undated
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
+from vio.files.dates import date_ns, undated
 from vio.files.stamps import SAMPLE_PACE, Pace, parse_stamps
 from vio.files.text import check_increasing, lines_of, text_lines, whole_ns_stamps
 from vio.files.units import (

@@ -6,23 +6,19 @@ the rotation vector of `R_i_v`, which maps the vehicle's axes to the inertial fr
 
 from __future__ import annotations
 
-import errno
-import math
-import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from vio.datasets.common import check_array_bytes, clock_ns, finite_rows, naming, shape_text
+from vio.datasets.common import clock_ns, finite_rows, naming, shape_text
 from vio.datasets.features import FeatureDataset
+from vio.datasets.mat_files import read_variables
 from vio.datasets.reader import Reader
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
 from vio.errors import DataError
-from vio.files.inputs import check_regular
 from vio.geometry.lie import FloatArray, checked_transform, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, Landmarks, Recording, Trajectory
@@ -79,9 +75,10 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
 
 
 def _read_mat(path: Path) -> Mapping[str, FloatArray]:
-    shapes, raw = _arrays_of_mat(path)
+    known = (*KEYS, *OPTIONAL_KEYS)
+    shapes, raw = read_variables(path, known.__contains__)
     _check_names(shapes, path)
-    wanted = [name for name in (*KEYS, *OPTIONAL_KEYS) if name in shapes]
+    wanted = [name for name in known if name in shapes]
     for key in wanted:
         if not isinstance(raw.get(key), np.ndarray) or raw[key].dtype.kind not in "fiu":
             raise DataError(f"{path}: {key} is not an array of real numbers; save it again as one")
@@ -96,41 +93,6 @@ def _check_names(names: Iterable[str], path: Path) -> None:
             f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found "
             f"{' '.join(held)}"
         )
-
-
-def _arrays_of_mat(path: Path) -> tuple[dict[str, tuple[int, ...]], Mapping[str, Any]]:
-    """Return the shapes of all variables of a MATLAB file, and those that are read here.
-
-    Raises:
-        DataError: it cannot be read, or is damaged or too large.
-    """
-    from scipy.io import loadmat, whosmat
-    from scipy.io.matlab import MatReadError
-
-    damage = (
-        MatReadError,
-        ValueError,
-        TypeError,
-        KeyError,
-        IndexError,
-        EOFError,
-        MemoryError,
-        zlib.error,
-    )
-    try:
-        check_regular(path)
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, "it is a folder")
-        shapes = {name: shape for name, shape, _ in whosmat(path)}
-        wanted = [name for name in (*KEYS, *OPTIONAL_KEYS) if name in shapes]
-        check_array_bytes({name: 8 * math.prod(shapes[name]) for name in wanted}, path)
-        return shapes, loadmat(path, mat_dtype=True, variable_names=wanted)
-    except NotImplementedError as error:
-        raise DataError(f"{path}: a MATLAB 7.3 file; save it again with `save -v7`") from error
-    except damage as error:
-        raise DataError(f"{path}: is damaged or no MATLAB file ({error}); copy it again") from error
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}; copy it again") from error
 
 
 def _rows(

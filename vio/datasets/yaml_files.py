@@ -31,6 +31,7 @@ NOISE_UNITS = {
 }
 # 'data:[1, 2]' and 'Viewer.PointSize:2', which OpenCV's reader takes for 'key: value'
 _LAX_KEY = re.compile(r"^(\s*(?:- )?[A-Za-z_][\w.\-]*):(?=[^\s:/\\])", re.MULTILINE)
+_END_OF_MESSAGE = re.compile(r"^---[ \t]*$", re.MULTILINE)
 MAX_BYTES = 1_000_000  # a calibration is some kilobytes; a larger file is another one
 
 
@@ -50,7 +51,7 @@ def read_yaml_file(path: Path, what: str = "the sensor's calibration") -> dict[s
     lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
     text = "\n".join(lines).replace("!!opencv-matrix", "")
     try:
-        entries = _strict_or_lax(text)
+        entries = _first_message(text)
     except ValueError as error:
         tabs = "character '\\t'" in str(error)
         remedy = "replace tabs by spaces" if tabs else "write plain numbers, or copy it again"
@@ -62,6 +63,26 @@ def read_yaml_file(path: Path, what: str = "the sensor's calibration") -> dict[s
             f"{path}: holds no calibration (expected 'key: value' lines); copy it again"
         )
     return {str(key): value for key, value in entries.items()}
+
+
+def _first_message(text: str) -> Any:
+    """Return the data of a YAML text, or of the first message where `rostopic echo` wrote it, which
+    ends each with a line of its own.
+
+    Raises:
+        ValueError: it is no YAML, or holds several documents of other entries.
+    """
+    parts = [part for part in _END_OF_MESSAGE.split(text) if part.strip()]
+    if not parts or not _END_OF_MESSAGE.search(text.lstrip()):
+        return _strict_or_lax(text)
+    first = _strict_or_lax(parts[0])
+    if len(parts) == 1:
+        return first
+    second = _strict_or_lax(parts[1])
+    is_alike = (
+        isinstance(first, dict) and isinstance(second, dict) and first.keys() == second.keys()
+    )
+    return first if is_alike else _strict_or_lax(text)
 
 
 def _strict_or_lax(text: str) -> Any:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from vio.dataclass import dataclass
 from vio.errors import EvaluationError
 from vio.files.epochs import epoch_hint
+from vio.files.stamps import ASSUMED_STEP_NS
 from vio.records import NS_PER_S, IntArray, Trajectory
 
 AssociationMode: TypeAlias = Literal["time", "frame"]
@@ -39,7 +40,7 @@ def associate(
     >= 1.
 
     By time where both have times, else by frame number: row k of a trajectory without frame numbers
-    is frame k.
+    is frame k. Times that were assumed, as of a recording that has none, count as none.
 
     Raises:
         EvaluationError: no poses match.
@@ -48,7 +49,9 @@ def associate(
         raise EvaluationError(
             f"cannot compare {len(estimate)} estimated poses with {len(reference)} reference poses"
         )
-    if estimate.times_ns is not None and reference.times_ns is not None:
+    # an assumed time is the number of its frame in other units
+    by_number = _has_assumed_times(estimate) and reference.frame_indices is not None
+    if estimate.times_ns is not None and reference.times_ns is not None and not by_number:
         rows, reference_rows = _by_time(
             estimate.times_ns, reference.times_ns, max_time_difference_s
         )
@@ -74,6 +77,14 @@ def associate(
             f"{reference_frames[0]} to {reference_frames[-1]}; give the reference of this recording"
         )
     return "frame", rows.astype(np.int64), reference_rows.astype(np.int64)
+
+
+def _has_assumed_times(estimate: Trajectory) -> bool:
+    """Return whether the times of numbered frames are those of frames without any."""
+    frames = estimate.frame_indices
+    if frames is None or estimate.times_ns is None:
+        return False
+    return np.array_equal(estimate.times_ns, ASSUMED_STEP_NS * frames)
 
 
 def _by_time(

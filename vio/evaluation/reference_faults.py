@@ -32,6 +32,7 @@ class _FaultRules(NamedTuple):
     finer: int = 10  # steps on either side of the best one, twice
     min_jump_m: float = 0.01  # to the identity: below, a body may stand at its start
     begun: float = 5.0  # of the largest further step, that a body does not jump by at its start
+    smooth: float = 0.9  # quantile of the steps' differences: jumps are fewer than the rest
     max_arm_m: float = 5.0  # of a reference's point from the body that is estimated
     fits: Tolerance[int] = 10  # of a lever arm beside an alignment
 
@@ -90,7 +91,11 @@ def position_fault(
                 "the body, as some programs write, and the other the body in the world; invert its "
                 "poses"
             )
-    return _held_fault(x, y, error_m) or _clock_fault(estimate, reference, _FAULT.explained)
+    return (
+        _held_fault(x, y, error_m)
+        or _jump_fault(x, y, error_m)
+        or _clock_fault(estimate, reference, _FAULT.explained)
+    )
 
 
 def _held_fault(x: FloatArray, y: FloatArray, error_m: float) -> str | None:
@@ -109,6 +114,42 @@ def _held_fault(x: FloatArray, y: FloatArray, error_m: float) -> str | None:
         f"{held.sum()} positions of the reference repeat the one before to the bit while the estimate "
         f"moves (ATE after Sim(3) {left_m:.3g} m without them, {error_m:.3g} m with): it holds its last "
         "pose where it lost the body; remove these rows"
+    )
+
+
+def _jump_fault(x: FloatArray, y: FloatArray, error_m: float) -> str | None:
+    """Return the note on single steps of a reference that the estimate does not make, as where a
+    receiver or a camera system takes another solution; None: there are none, or they explain
+    nothing of the error.
+
+    Args:
+        x: (M, 3) positions of the estimate.
+        y: (M, 3) of the reference.
+        error_m: between them, after a similarity.
+    """
+    own = np.diff(x, axis=0)
+    other = np.diff(y, axis=0)
+    own_m = np.linalg.norm(own, axis=1)
+    other_m = np.linalg.norm(other, axis=1)
+    scale = float(np.median(other_m) / max(np.median(own_m), _ROUNDING))
+    further_m = other_m - scale * own_m
+    least_m = max(_FAULT.begun * float(np.quantile(np.abs(further_m), _FAULT.smooth)), _ROUNDING)
+    jumps = further_m > max(least_m, _FAULT.min_jump_m)
+    if not jumps.any():
+        return None
+    U, _, Vt = np.linalg.svd(other[~jumps].T @ own[~jumps])
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    other[jumps] = scale * own[jumps] @ R.T
+    left_m = float(_errors(x, np.concatenate([y[:1], y[0] + np.cumsum(other, axis=0)]))[0])
+    if not left_m < _FAULT.explained * error_m:
+        return None
+    first = int(np.flatnonzero(jumps)[0]) + 2
+    count = int(jumps.sum())
+    return (
+        f"the reference jumps {count} time{'s' * (count > 1)} by up to "
+        f"{further_m.max():.3g} m, first at pose {first} of {len(y)} that were compared, where the "
+        f"estimate does not (ATE after Sim(3) {left_m:.3g} m without the jumps, {error_m:.3g} m with): "
+        "leave out what lies between them, or the part that is off"
     )
 
 

@@ -43,7 +43,9 @@ _OF_A_POSITION = frozenset(
     ("std", "stddev", "cov", "var", "sigma", "err", "error", "vel", "velocity")
 )
 # what stands where a quaternion would, and is none
-_NO_QUATERNION = re.compile(r"roll|pitch|yaw|heading|euler|azimuth|vel|speed|^v|status|std|cov")
+_NO_QUATERNION = re.compile(
+    r"roll|pitch|yaw|heading|euler|omega|kappa|azimuth|vel|speed|^v|status|std|cov"
+)
 # components of a position on the earth, of right-handed frames
 _EAST, _NORTH, _UP, _DOWN, _HEIGHT = (
     re.compile(rf"(?:p|pos|position|local|utm|enu|ned)?(?:{name})")
@@ -55,7 +57,16 @@ _EAST, _NORTH, _UP, _DOWN, _HEIGHT = (
         "alt(?:itude)?|height|elev(?:ation)?",
     )
 )
-_ON_EARTH = ((_EAST, _NORTH, _UP), (_NORTH, _EAST, _DOWN), (_EAST, _NORTH, _HEIGHT))
+_X = re.compile("x")
+_Y = re.compile("y")
+_ON_EARTH = (
+    (_EAST, _NORTH, _UP),
+    (_NORTH, _EAST, _DOWN),
+    (_EAST, _NORTH, _HEIGHT),
+    (_X, _Y, _HEIGHT),
+)
+# behind the letter of an axis, as of X/East
+_ALSO_ON_EARTH = re.compile(r"(?<=^[xyz])/(?:east|north|alt)[a-z]*$")
 # a component by its number, as position[0] or q_3
 _NUMBERED = re.compile(r"([a-z][a-z_. ]*?)[\[(_. ]?([0-4])[\])]?")
 _POSITION_ALONE = re.compile(r"(?:p|t|pos|position|trans|translation|xyz)")
@@ -130,11 +141,9 @@ def _cells_of(headers: Sequence[str], count: int) -> list[list[str]]:
 
 def are_geographic(headers: Sequence[str]) -> bool:
     """Return whether the last header of a table names latitude and longitude."""
-    names = (
-        [re.sub(r"[^a-z]", "", without_unit(cell)) for cell in split_cells(headers[-1].lower())]
-        if headers
-        else []
-    )
+    cells = split_cells(headers[-1].lower()) if headers else []
+    parts = [part for cell in cells for part in without_unit(cell).split("/")]
+    names = [re.sub(r"[^a-z]", "", part) for part in parts]
     return any(name.startswith("lat") for name in names) and any(
         name.startswith(("lon", "lng")) for name in names
     )
@@ -253,7 +262,9 @@ def _position(
         by_any_name: whether other words than those of a position may stand before x, y and z.
     """
     lengths = [
-        "" if k in quaternion else without_unit(cell, (*LENGTH_UNITS, *UNREAD_LENGTHS))
+        ""
+        if k in quaternion
+        else _ALSO_ON_EARTH.sub("", without_unit(cell, (*LENGTH_UNITS, *UNREAD_LENGTHS)))
         for k, cell in enumerate(cells)
     ]
     groups = _components(lengths, _POSITION_STEMS, "xyz")

@@ -32,6 +32,7 @@ _SIZES: tuple[tuple[TimeUnit, Decimal], ...] = (
     ("us", Decimal("1e14")),
     ("ms", Decimal("1e11")),
 )
+ASSUMED_STEP_NS = 100_000_000  # between frames of a recording without times
 _DECADES = 1000.0  # between two units
 _FEWEST_STEPS = 2  # which tell a unit: two frames may share an arrival
 _ODD_STEP = 0.5  # of the median interval: frames that jitter differ by less

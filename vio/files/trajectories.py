@@ -20,6 +20,8 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
+from vio.files.dates import undated
+from vio.files.messages import joined_stamps
 from vio.files.pose_columns import PoseColumns, are_geographic, named_columns, pose_columns
 from vio.files.stamps import POSE_PACE, parse_stamps
 from vio.files.text import exact_text, lines_of, seconds_text, whole_ns_stamps
@@ -50,6 +52,10 @@ _LED_COLUMNS: dict[int, BodyFrame] = {_KITTI_COLUMNS + 1: "imu", _WHOLE_COLUMNS 
 _MATRIX_COLUMNS = (_KITTI_COLUMNS, _WHOLE_COLUMNS, *_LED_COLUMNS)
 _GRAPH = re.compile(r"(?:VERTEX|EDGE|PARAMS)[_A-Z0-9]*(?::\w+)? ")
 _WHOLE = re.compile(r"[+-]?\d+")
+_IMAGE = re.compile(r"\"?([^\s,;\"]*)\.(?:png|jpe?g|tiff?|bmp|pgm|ppm|webp)\"?", re.IGNORECASE)
+_NUMBER_OF_A_FRAME = re.compile(
+    r"#?\s*(?:frames?|images?|index|idx|num(?:ber)?|(?:frame|image)[ _]?(?:id|index|idx|no|num(?:ber)?))"
+)
 
 
 class _PoseRules(NamedTuple):
@@ -57,6 +63,7 @@ class _PoseRules(NamedTuple):
 
     max_coordinate_m: float = 1e12  # of a coordinate, in metres: beyond, squares overflow
     max_frame_number: int = 10_000_000  # whole numbers beyond are times
+    largest: Tolerance[float] = 1.001  # an element of a rotation
     rounded_norm: float = 0.02  # from one, of quaternions with two decimals
     exact_deviation: Tolerance[float] = 1e-12  # rotations this close to orthonormal keep their bits
 
@@ -142,7 +149,7 @@ def read_trajectory(
             f"{', '.join(get_args(TrajectoryFormat))}"
         )
     if Path(path).is_dir():
-        raise DataError(f"{path}: is a folder; give a file of poses")
+        raise DataError(f"{path}: is a folder; give one file of all poses, a line each")
     table = _read_table(Path(path))
     if not table.rows:
         raise DataError(f"{table.path}: holds no poses; give a TUM, KITTI or EuRoC trajectory file")
@@ -181,6 +188,11 @@ def _named(table: _Table) -> PoseColumns | None:
         named = named_columns(table.comments, count, w_first=table.commas)
     except DataError as error:
         raise DataError(f"{table.path}: {error}") from error
+    if named is None and are_geographic(table.comments):
+        raise DataError(
+            f"{table.path}: its header names latitude and longitude, which are no metres; give "
+            "positions in metres, as a local frame of east, north and up has them"
+        )
     return None if named is None or _are_of_matrices(table, named) else named
 
 
@@ -189,16 +201,14 @@ def _are_of_matrices(table: _Table, named: PoseColumns) -> bool:
     count = len(table.fields(0))
     if count not in _MATRIX_COLUMNS or named.quaternion is not None:
         return False
+    first = table.fields(0)[0]
+    if count not in _LED_COLUMNS and _is_number(first) and abs(float(first)) > _POSES.largest:
+        return False
     return not named.names_stamp or (count in _LED_COLUMNS and not table.commas)
 
 
 def _unnamed(table: _Table, *, w_first: bool) -> PoseColumns:
     """Return the columns of a table whose header does not name them."""
-    if are_geographic(table.comments):
-        raise DataError(
-            f"{table.path}: its header names latitude and longitude, which are no metres; give "
-            "positions in metres, as a local frame of east, north and up has them"
-        )
     return pose_columns(table.comments, len(table.fields(0)), w_first=w_first)
 
 
@@ -299,6 +309,7 @@ def _times_ns(table: _Table, columns: PoseColumns, kind: TrajectoryFormat) -> In
     EuRoC's form has whole numbers, else by their size and by how far apart poses are.
     """
     stamps = _stamp_texts(table, columns)
+    _check_numbers(table, columns, stamps)
     unit = columns.unit
     if unit is None and kind == "euroc" and _are_nanoseconds(stamps):
         unit = "ns"
@@ -314,6 +325,21 @@ def _times_ns(table: _Table, columns: PoseColumns, kind: TrajectoryFormat) -> In
     for doubt in doubts:
         logger.warning("%s", doubt)
     return times_ns
+
+
+def _check_numbers(table: _Table, columns: PoseColumns, stamps: Sequence[str]) -> None:
+    """Raise DataError where a header calls the numbers of frames so that are taken for times."""
+    if columns.names_stamp or not table.comments:
+        return
+    names = split_cells(table.comments[-1])
+    is_number = len(names) > columns.stamp and _NUMBER_OF_A_FRAME.fullmatch(
+        names[columns.stamp].strip().lower()
+    )
+    if is_number and all(_WHOLE.fullmatch(stamp) for stamp in stamps):
+        raise DataError(
+            f"{table.path}: its column {names[columns.stamp]!r} numbers frames, and none has their times; "
+            "write the time of each frame in its place"
+        )
 
 
 def _are_nanoseconds(stamps: Sequence[str]) -> bool:
@@ -438,7 +464,7 @@ def is_trajectory_file(path: Path) -> bool:
             lambda: stream.readline(_COMMENTS.max_line_bytes).decode("utf-8", errors="replace"), ""
         )
         rows = (line for line in lines if line.strip() and line[0] not in "#%")
-        first = next((line for line in rows if not _is_header(line)), "")
+        first = undated(next((line for line in rows if not _is_header(line)), ""))
     fields = split_cells(first.rstrip().rstrip(",;"))
     try:
         [float(field) for field in fields]
@@ -468,8 +494,10 @@ def _read_table(path: Path) -> _Table:
             comments.append(line)
             header = line
         elif line:
-            rows.append(line.rstrip(",;").rstrip())
+            rows.append(undated(line.rstrip(",;").rstrip()))
             line_numbers.append(number)
+    rows, named = joined_stamps(_without_suffixes(rows, path), stated=bool(comments))
+    comments += named
     first = rows[0] if rows else ""
     cells = split_cells(first)
     if "," in first and re.search(r"[;\t]", first) and all(map(_is_number, cells)):
@@ -481,6 +509,27 @@ def _read_table(path: Path) -> _Table:
     separator = "," if "," in first else ";" if ";" in first else None
     _check_poses(path, comments, first)
     return _Table(path, comments, rows, line_numbers, separator, header)
+
+
+def _without_suffixes(rows: Sequence[str], path: Path) -> list[str]:
+    """Return rows that begin with the names of images, as of photogrammetry, without the suffixes.
+
+    Raises:
+        DataError: the names are no times.
+    """
+    names = [_IMAGE.match(row) for row in rows]
+    found = [name for name in names if name is not None]
+    if not found or len(found) < len(rows):
+        return list(rows)
+    stems = [name[1] for name in found]
+    if any(not _is_number(stem) or float(stem) < _POSES.max_frame_number for stem in stems):
+        raise DataError(
+            f"{path}: begins its rows with names of images ({found[0][0]}), which are no times; write the "
+            "time of each image in its place"
+        )
+    return [
+        f"{stem}{row[name.end() :]}" for stem, name, row in zip(stems, found, rows, strict=True)
+    ]
 
 
 def _check_poses(path: Path, comments: Sequence[str], first: str) -> None:
@@ -518,10 +567,10 @@ def _is_number(text: str) -> bool:
 
 def _detect(table: _Table, named: PoseColumns | None) -> TrajectoryFormat:
     """Detect the format from the first row, and from the columns that a header names."""
-    if table.commas:
-        return "euroc"
     n = len(table.fields(0))
     kitti = n in _MATRIX_COLUMNS
+    if table.commas:
+        return "kitti" if kitti and named is None and _begins_with_a_matrix(table) else "euroc"
     if _GRAPH.match(table.rows[0]):
         raise DataError(
             f"{table.path}: is a graph of poses (g2o, TORO), which have no times; write them as "
@@ -531,6 +580,18 @@ def _detect(table: _Table, named: PoseColumns | None) -> TrajectoryFormat:
         forms = "; ".join(f"{kind}: {columns}" for kind, columns in _COLUMNS.items())
         table.fail(0, f"{n} columns fit no known format ({forms}){_without_times(n)}")
     return "kitti" if kitti and named is None else "tum"
+
+
+def _begins_with_a_matrix(table: _Table) -> bool:
+    """Return whether the first row holds a rotation and a position, row by row, as `_kitti_poses`
+    reads them.
+    """
+    first = int(len(table.fields(0)) in _LED_COLUMNS)
+    try:
+        _kitti_poses(_some_rows(table, [0]), first)
+    except DataError:
+        return False
+    return True
 
 
 def _without_times(count: int) -> str:

@@ -30,6 +30,7 @@ from vio.datasets.rigs import (
     depthai,
     edex,
     eth3d,
+    matlab,
     monado,
     okvis,
     orbslam,
@@ -61,6 +62,7 @@ from vio.datasets.rigs.source import Source, stereo_pose_on_imu
 from vio.datasets.sides import side_word
 from vio.datasets.yaml_files import Entries, read_json_file
 from vio.errors import CalibrationError, DataError
+from vio.files.text import text_lines
 from vio.geometry.lie import se3_from_parts, se3_inverse
 
 __all__ = ["find_calibration", "load_rig"]
@@ -70,8 +72,9 @@ Size = tuple[int, int]
 KNOWN = (
     "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt "
     "or calib_cam_to_cam.txt, OpenCV's stereo .yml, .xml or .npz (M1 D1 M2 D2 R T), ROS's left.yaml and "
-    "right.yaml, or BoofCV's stereo.xml; or the settings of ORB-SLAM, stella_vslam, VINS, OKVIS, Kimera or SVO, "
-    "Basalt's, Monado's, DepthAI's or Spectacular AI's JSON, cuVSLAM's EDEX, or a ZED's SN*.conf"
+    "right.yaml, BoofCV's stereo.xml, or MATLAB's stereo parameters; or the settings of ORB-SLAM, stella_vslam, "
+    "VINS, OKVIS, Kimera or SVO, Basalt's, Monado's, DepthAI's or Spectacular AI's JSON, cuVSLAM's EDEX, or a "
+    "ZED's SN*.conf"
 )
 _OTHERS = (
     ".yaml",
@@ -81,8 +84,21 @@ _OTHERS = (
     ".conf",
     ".npz",
     edex.SUFFIX,
+    matlab.SUFFIX,
 )  # whose content decides in any folder
+_NAMED = "relative_config_imucam"  # in OpenVINS's settings: the file of its cameras
 _REPORT_BYTES = 100  # of a text, which show what it is
+# what texts of other tools are, by how they begin, and what to give instead
+_REPORTS = {
+    b"Calibration results": "Kalibr's report in words; give the camchain-….yaml that it wrote beside it",
+    b"oST version": "camera_calibration's text; give the left.yaml and right.yaml that it wrote beside it",
+    b"Camera list with": "a model of COLMAP, whose cameras have no baseline; give the calibration of the rig",
+}
+# entries of files that describe no cameras, and what these are
+_NO_CAMERAS = {
+    "target_type": "a board to calibrate with",
+    "gyroscope_noise_density": "an IMU alone",
+}
 _MAX_OTHERS = 40  # files looked into; a folder with more is no recording's
 # whether entries are of a format, and what reads it; the first that fits does
 _FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] = (
@@ -97,6 +113,8 @@ _FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] 
     (basalt.matches, basalt.read),
     (depthai.matches, depthai.read),
     (zed.matches, zed.read),
+    (matlab.matches, matlab.read),
+    (lambda entries: _NAMED in entries, lambda source: _openvins(source)),
     (lambda entries: _is_sensor_sheet(entries), lambda source: _euroc(source)),
     (is_camera_info, lambda source: _camera_infos(source)),
     (is_opencv, lambda source: rig_from_opencv(source.entries, source.where, source.image_size)),
@@ -199,6 +217,8 @@ def _entries(path: Path) -> Entries:
         return read_json_file(path)
     if suffix == ".npz":
         return read_arrays(path)
+    if suffix == matlab.SUFFIX:
+        return matlab.read_mat(path)
     if suffix == ".conf" and not path.read_bytes().startswith(b"%YAML"):
         return zed.read_conf(path)
     if suffix == ".xml":
@@ -232,32 +252,46 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
             f"{path}: names its cameras {', '.join(named)}; Kalibr's are cam0 (left) and cam1: name "
             "them so"
         )
+    what = next((what for name, what in _NO_CAMERAS.items() if name in entries), None)
+    if what is not None:
+        raise CalibrationError(
+            f"{path}: describes {what}; give the file of the cameras, as Kalibr's camchain-….yaml"
+        )
     raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
 
 
-def _is_report(path: Path) -> bool:
-    """Return whether a text is what Kalibr writes for people."""
+def _report_of(path: Path) -> str:
+    """Return what a text is that a tool writes for people, and what to give; empty: it is none."""
     try:
         with path.open("rb") as file:
-            return file.read(_REPORT_BYTES).lstrip().startswith(b"Calibration results")
+            first = file.read(_REPORT_BYTES).lstrip(b"# \t\r\n")
     except OSError:  # which its reader reports
-        return False
+        return ""
+    return next((what for begins, what in _REPORTS.items() if first.startswith(begins)), "")
 
 
 def _read_txt(path: Path, image_size: Size | None) -> Rig:
-    if _is_report(path):
-        raise CalibrationError(
-            f"{path}: is Kalibr's report in words; give the camchain-….yaml that it wrote beside it"
-        )
+    if what := _report_of(path):
+        raise CalibrationError(f"{path}: is {what}")
     if bare.is_bare(path):
         return bare.read_bare(path, image_size)
     rig = read_middlebury(path, image_size)
-    return kitti_rig(path, image_size)[0] if rig is None else rig
+    if rig is not None:
+        return rig
+    if not any(re.match(r"P\d:", line) for _, line in text_lines(path)):
+        raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
+    return kitti_rig(path, image_size)[0]
 
 
 def _is_sensor_sheet(entries: Entries) -> bool:
     """Return whether entries are those of a camera's `sensor.yaml`."""
     return "T_BS" in entries and ("intrinsics" in entries or "camera_model" in entries)
+
+
+def _openvins(source: Source) -> Rig:
+    """Read the camchain that OpenVINS's settings name, beside them."""
+    camchain = source.path.with_name(str(source.entries[_NAMED]))
+    return read_camchain(camchain, alone=source.cameras == 1)
 
 
 def _camera_infos(source: Source) -> Rig:

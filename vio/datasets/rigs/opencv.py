@@ -10,6 +10,7 @@ rectified already.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -57,6 +58,7 @@ _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
     "P0": ("P1", "LEFT.P", "projMatrixL", "PL"),
     "P1": ("P2", "RIGHT.P", "projMatrixR", "PR"),
 }  # fmt: skip
+_NUMBERED = re.compile(r"cam(?:era)?_?\d")  # blocks of Kalibr's form
 _LONG_NAME = 6  # letters
 _SAME = 1e-6  # share by which numbers that were written with fewer digits differ
 _MOST_NUMBERS = 100  # of a matrix; maps of pixels have more
@@ -80,7 +82,20 @@ _SIZES = (
 
 def is_opencv(entries: Entries) -> bool:
     """Return whether entries hold matrices of a stereo calibration, raw or rectified."""
+    entries = _without_blocks(entries)
     return all(_find(entries, key) is not None for key in ("K0", "K1")) or _is_rectified(entries)
+
+
+def _without_blocks(entries: Entries) -> dict[str, object]:
+    """Return entries with those of blocks, as of `left:` and `right:`, by both names joined."""
+    flat = dict[str, object]()
+    for name, value in entries.items():
+        of_another_form = _NUMBERED.fullmatch(name) is not None
+        if not isinstance(value, dict) or "data" in value or of_another_form:
+            flat[name] = value
+        else:
+            flat |= {f"{name}_{inner}": part for inner, part in value.items()}
+    return flat
 
 
 def _is_rectified(entries: Entries) -> bool:
@@ -130,6 +145,7 @@ def rig_from_opencv(entries: Entries, where: str, image_size: tuple[int, int] | 
     Raises:
         CalibrationError: a matrix is missing or impossible, or no image size is known.
     """
+    entries = _without_blocks(entries)
     width, height, stated = _size(entries, where, image_size)
     rig = (_rectified if _find(entries, "K0") is None else _raw)(entries, where, width, height)
     rig = checked_rig(rig, where, size_stated=stated)

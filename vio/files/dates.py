@@ -51,9 +51,12 @@ def undated(line: str) -> str:
     if line[4:5] != "-" or (found := _WRITTEN.match(line)) is None:
         return line
     rest = line[found.end() :]
-    if rest[:1] in ",;\t ":
+    if rest[:1] not in ",;\t ":
+        return line
+    try:
         return f"{date_ns(found[0])}{rest}"
-    return line
+    except ValueError:  # as of a 13th month, which its reader reports
+        return line
 
 
 def dates_in_names(stems: Sequence[str]) -> IntArray | None:
