@@ -95,6 +95,13 @@ class RightDelay(Finder):
         # that came with the last frame, where it is used with this one
         self._last_right: Image | None = None
 
+    @property
+    def shown_frames(self) -> float:
+        """The delay in frames of right images as they come, with that of images that are kept for
+        their left ones.
+        """
+        return self.frames - 1.0 if self._early else self.frames
+
     def paired(self, right: Image) -> Image | None:
         """Return the right image (H, W) of the present left image's time; None: it was not kept."""
         if not self._early:

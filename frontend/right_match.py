@@ -102,7 +102,7 @@ class RightMatcher:
         else:
             self._shake.explained(frame.index)
             T = _motion_between(prior, motion)
-            matched = self._match_delayed(previous, tracks, right, flow, T, stereo, delay)
+            matched = self._match_delayed(images, previous, tracks, right, flow, T, delay)
         if not self._right.check_matches(frame.index, matched.has_right[testable], moved=tested):
             if self._right.contradicts and self._delay.suspect(
                 frame.index, self._count_pairings(previous, left, tracks, right, stereo), frame_s
@@ -124,7 +124,7 @@ class RightMatcher:
         was the delay is no more taken out.
         """
         stereo.restart_rows()
-        if self._turn.explained(index, self._delay.frames):
+        if self._turn.explained(index, self._delay.shown_frames):
             stereo.take_out(0.0)
             stereo.forget_offset()
         return no_tracks()
@@ -209,30 +209,40 @@ class RightMatcher:
 
     def _match_delayed(
         self,
+        images: FrameImages,
         previous: PreviousFrame,
         tracks: Tracks,
         right: ImageLevels,
         flow: FloatArray,
         T: FloatArray,
-        stereo: StereoFit,
         delay: float,
     ) -> Tracks:
         """Match features in a right image of another time, and bring the matches to the present.
 
+        Features without depth are searched in the two images that were exposed nearest to one
+        another.
+
         Args:
+            images: of this frame.
             previous: the last frame.
             tracks: features at their new left pixels.
             right: the right image.
             flow: motion (N, 2) of the features since the last frame, pixels.
             T: motion (4, 4) of the camera, `T_curr_prev`.
-            stereo: the matcher.
             delay: of the right image, in the time since the last frame.
         """
+        stereo = images.stereo
         then = stereo.track_right(at_exposure(tracks, flow, T, delay), right, True)
         rows = (~then.has_right & ~then.has_point).nonzero()[0]
-        disparity, unique = stereo.search(
-            previous.left.half, right.half, (tracks.left - flow)[rows]
-        )
+        left_half = images.left.half
+        right_half = right.half
+        points = tracks.left
+        if delay > 0.0:
+            left_half = previous.left.half
+            points = tracks.left - flow
+        elif delay < -0.5 and previous.right_half is not None:
+            right_half = previous.right_half
+        disparity, unique = stereo.search(left_half, right_half, points[rows])
         then = stereo.match_near(then, right, rows[unique], disparity[unique])
         stereo.update_rows(then)
         return at_present(self._camera, tracks, then, T, delay)

@@ -187,6 +187,23 @@ def test_depths_of_cameras_that_expose_apart_are_right_also_where_frames_are_mis
     assert "the right camera has not turned" in said
 
 
+@pytest.mark.parametrize(("late", "most_px"), [(0.5, 0.1), (-0.5, 0.25)])
+def test_new_features_have_depths_beside_a_camera_that_exposes_earlier_or_later(
+    late: float, most_px: float
+) -> None:
+    """They are searched in the two images that were exposed nearest to one another: with the last
+    left image, where the right camera is early, two thirds had none.
+    """
+    frontend = KltFrontend(CAMERA, FrontendSettings(grid=GridSettings(target_features=150)))
+    for k in range(22):
+        right = stereo_frame(k, _swaying(max(k - late, 0.0))).right
+        output = frontend.process(replace(stereo_frame(k, _swaying(k)), right=right))
+    seen = output.observations.take(output.observations.has_right)
+    assert len(seen) > 100
+    expected = truth(SLANTED, _swaying(21), seen.z[:, :2], _swaying(21))
+    assert np.median(np.abs(seen.z[:, 2] - expected[:, 2])) < most_px
+
+
 def test_a_turn_that_no_delay_explains_stays() -> None:
     turn = RightTurn(700.0)
     for k in range(6):
