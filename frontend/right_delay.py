@@ -24,7 +24,7 @@ from vio.frontend.weighted_fit import ROW_SIGMA_PX, add_equations
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays
 from vio.numerics.compiled import solve_positive
-from vio.numerics.robust import robust_sigma
+from vio.numerics.robust import median, robust_sigma
 from vio.records import Image
 
 
@@ -44,6 +44,8 @@ class _DelayRules(NamedTuple):
     # one
     whole_slack_frames: float = 0.15
     forget_frames: float = 0.1  # delay below which the images are taken to be simultaneous again
+    first_steps: int = 9  # between frames, whose median is the frame that a delay is counted in
+    jitter_share: float = 0.25  # of it, by which the time between two frames differs as usual
 
 
 _DELAY = _DelayRules()
@@ -89,8 +91,16 @@ class RightDelay(Finder):
         self.frames = 0.0  # the delay in frames to be taken out; 0: none is significant
         self._code = "right-image-late"  # of the last finding
         self._early = False  # each right image is used with the next left one
+        self._steps_s: list[float] = []  # the first times between frames
         # that came with the last frame, where it is used with this one
         self._last_right: Image | None = None
+
+    @property
+    def shown_frames(self) -> float:
+        """The delay in frames of right images as they come, with that of images that are kept for
+        their left ones.
+        """
+        return self.frames - 1.0 if self._early else self.frames
 
     def paired(self, right: Image) -> Image | None:
         """Return the right image (H, W) of the present left image's time; None: it was not kept."""
@@ -105,6 +115,13 @@ class RightDelay(Finder):
         self._forget()
         self.frames = float(frames)
 
+    def count(self, step_s: float) -> float:
+        """Return how many frames a time between two is; more than one where frames are missing."""
+        if len(self._steps_s) < _DELAY.first_steps:
+            self._steps_s.append(step_s)
+        frames = step_s / median(self._steps_s)
+        return 1.0 if abs(frames - 1.0) <= _DELAY.jitter_share else frames
+
     def update(
         self, index: int, left: FloatArray, flow: FloatArray, rows: FloatArray, frame_s: float
     ) -> bool:
@@ -113,9 +130,9 @@ class RightDelay(Finder):
         Args:
             index: frame number.
             left: left pixels (N, 2).
-            flow: their motion (N, 2) since the last frame, pixels.
+            flow: their motion (N, 2) in the time of a frame, pixels.
             rows: right rows minus left rows (N,), pixels, as measured.
-            frame_s: time since the last frame.
+            frame_s: that time.
         """
         if len(left) < _DELAY.min_matches:
             return False

@@ -19,6 +19,7 @@ from vio.frontend.stereo_match import ROW_SEARCH, mirrored, shifted_rows
 from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.robust import median
 from vio.records import BoolArray, Image, IntArray, SigmaArray, TrackPrior
 
 _NEARLY_ALL = 0.9  # of the matches without an offset, that one with it may have
@@ -84,35 +85,49 @@ class RightMatcher:
         if not self._right.usable:
             tracks = with_prior_depths(self._camera, tracks, prior)
         testable = stereo.testable(tracks)
-        delay = self._delay.frames
+        step_s = (frame.time_ns - previous.time_ns) * 1e-9
+        frames = self._delay.count(step_s)
+        frame_s = step_s / frames
+        delay = self._delay.frames / frames  # in the time since the last frame
         flow = tracks.left - previous.tracks.left[_rows_by_slot(previous.tracks, tracks)]
         # Wrong matches, of rows far apart, contradict the right image that the search for the rows
         # will need.
         tested = motion is not None and not stereo.has_few_matches
         if delay == 0.0:
             matched = stereo.track_right(tracks, right, motion is not None)
-            matched = self._take_turn(images, right, tracks, matched, testable, tested=tested)
+            flow_px = median(flow[:, 0]) / frames if len(flow) else 0.0
+            matched = self._take_turn(
+                images, right, tracks, matched, testable, tested=tested, flow_px=flow_px
+            )
         else:
             self._shake.explained(frame.index)
             T = _motion_between(prior, motion)
-            matched = self._match_delayed(previous, tracks, right, flow, T, stereo)
-        frame_s = (frame.time_ns - previous.time_ns) * 1e-9
+            matched = self._match_delayed(images, previous, tracks, right, flow, T, delay)
         if not self._right.check_matches(frame.index, matched.has_right[testable], moved=tested):
             if self._right.contradicts and self._delay.suspect(
                 frame.index, self._count_pairings(previous, left, tracks, right, stereo), frame_s
             ):
                 self._right.explained()
-                stereo.restart_rows()
-                return no_tracks()
+                return self._begin_again(frame.index, stereo)
             return tracks
         self._rows_off = None
         seen = matched.has_right
         disparity_v = matched.right[seen, 1] - matched.left[seen, 1]
         rows = disparity_v - delay * flow[seen, 1]
-        if self._delay.update(frame.index, matched.left[seen], flow[seen], rows, frame_s):
-            stereo.restart_rows()
-            return no_tracks()  # their depths are those of images of different times
+        in_frame = flow[seen] / frames
+        if self._delay.update(frame.index, matched.left[seen], in_frame, rows, frame_s):
+            return self._begin_again(frame.index, stereo)
         return matched
+
+    def _begin_again(self, index: int, stereo: StereoFit) -> Tracks:
+        """Return no features, as their depths are those of images of different times; a turn that
+        was the delay is no more taken out.
+        """
+        stereo.restart_rows()
+        if self._turn.explained(index, self._delay.shown_frames):
+            stereo.take_out(0.0)
+            stereo.forget_offset()
+        return no_tracks()
 
     def complete(self, images: FrameImages, tracks: Tracks) -> Tracks:
         """Return all features of a frame with the virtual matches that a depth image gives; learn
@@ -134,6 +149,7 @@ class RightMatcher:
         testable: BoolArray,
         *,
         tested: bool,
+        flow_px: float = 0.0,
     ) -> Tracks:
         """Return the matches of a frame, of a right image whose rows are off where more are found
         so; then the right camera has turned, or shakes.
@@ -153,7 +169,7 @@ class RightMatcher:
                 matched = off
             else:
                 stereo.forget_offset()
-        turn_px = self._turn.frame(index, stereo.offset_px)
+        turn_px = self._turn.frame(index, stereo.offset_px, flow_px)
         if turn_px is not None:
             stereo.take_out(turn_px)
         return matched
@@ -193,29 +209,40 @@ class RightMatcher:
 
     def _match_delayed(
         self,
+        images: FrameImages,
         previous: PreviousFrame,
         tracks: Tracks,
         right: ImageLevels,
         flow: FloatArray,
         T: FloatArray,
-        stereo: StereoFit,
+        delay: float,
     ) -> Tracks:
         """Match features in a right image of another time, and bring the matches to the present.
 
+        Features without depth are searched in the two images that were exposed nearest to one
+        another.
+
         Args:
+            images: of this frame.
             previous: the last frame.
             tracks: features at their new left pixels.
             right: the right image.
             flow: motion (N, 2) of the features since the last frame, pixels.
             T: motion (4, 4) of the camera, `T_curr_prev`.
-            stereo: the matcher.
+            delay: of the right image, in the time since the last frame.
         """
-        delay = self._delay.frames
+        stereo = images.stereo
         then = stereo.track_right(at_exposure(tracks, flow, T, delay), right, True)
         rows = (~then.has_right & ~then.has_point).nonzero()[0]
-        disparity, unique = stereo.search(
-            previous.left.half, right.half, (tracks.left - flow)[rows]
-        )
+        left_half = images.left.half
+        right_half = right.half
+        points = tracks.left
+        if delay > 0.0:
+            left_half = previous.left.half
+            points = tracks.left - flow
+        elif delay < -0.5 and previous.right_half is not None:
+            right_half = previous.right_half
+        disparity, unique = stereo.search(left_half, right_half, points[rows])
         then = stereo.match_near(then, right, rows[unique], disparity[unique])
         stereo.update_rows(then)
         return at_present(self._camera, tracks, then, T, delay)

@@ -69,6 +69,7 @@ class RightTurn(Finder):
         self._turn_px = 0.0  # that stays, and is taken out
         self._were_off = deque[bool](maxlen=_SHAKE.recent_frames)
         self._offsets: list[float] = []  # of the last frames in a row that were off, pixels
+        self._flow_px = 0.0  # by which features moved along u in a frame when a turn was found
 
     @property
     def may_stay(self) -> bool:
@@ -92,10 +93,27 @@ class RightTurn(Finder):
     def _is_off(self, offset_px: float) -> bool:
         return abs(offset_px - self._turn_px) > _TURN.min_offset_px
 
-    def frame(self, index: int, offset_px: float | None) -> float | None:
+    def explained(self, index: int, delay: float) -> bool:
+        """Return whether what was taken for a turn is what a right camera shows that is late by a
+        delay in frames, which has been found since; then it is none.
+        """
+        shown_px = delay * self._flow_px
+        if not abs(self._turn_px - shown_px) < 0.5 * abs(self._turn_px):
+            return False
+        self._turn_px = 0.0
+        self._offsets = []
+        self._were_off.clear()
+        message = f"frame {index}: the right camera has not turned: it exposes at another time"
+        self._found.append(Finding(_CODE, message, index, ended=True))
+        return True
+
+    def frame(self, index: int, offset_px: float | None, flow_px: float = 0.0) -> float | None:
         """Take by how much the disparities of a frame are off, against those of the pair as it was.
 
-        None: they are not, or nothing is known.
+        Args:
+            index: frame number.
+            offset_px: by how much; None: they are not, or nothing is known.
+            flow_px: by which features have moved along u in the time of a frame, median.
 
         Returns:
             The offset that stays, from now on; None: none does.
@@ -113,6 +131,7 @@ class RightTurn(Finder):
         ):
             return None
         self._turn_px = stays
+        self._flow_px = flow_px
         self._offsets = []
         self._were_off.clear()
         turned_deg = float(np.degrees(np.arctan(stays / self._focal_px)))

@@ -94,6 +94,16 @@ def test_twist_noise_does_not_depend_on_how_the_time_is_cut() -> None:
     np.testing.assert_allclose(np.diag(whole.Q)[6:12], 0.2 * np.repeat([1.0, 0.3], 3) ** 2)
 
 
+def test_twist_noise_over_a_minute_of_turning_is_a_covariance() -> None:
+    """Images alone go on through a gap between frames as they moved before it."""
+    motion = TwistMotion(SETTINGS)
+    turning = replace(ORIGIN, velocity=np.array([2.0, 0.0, 0.0]), rate=np.array([0.0, 0.0, 1.0]))
+    whole = motion.advance(turning, 0, 60_000_000_000)
+    assert np.linalg.eigvalsh(whole.Q).min() > 0.0
+    assert np.sqrt(np.diag(whole.Q)[:3]).max() < 1000.0
+    assert np.sqrt(np.diag(whole.Q)[5]) == pytest.approx(0.3 * np.sqrt(60.0**3 / 3.0), rel=0.01)
+
+
 @pytest.mark.parametrize("kind", ["imu", "twist"])
 def test_factors_scale_their_own_part_of_the_noise(kind: str) -> None:
     """The first is the translation's, the second the rotation's; the biases' walk is no part of

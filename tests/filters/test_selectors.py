@@ -93,6 +93,18 @@ def test_causal_visibility_prefers_the_most_observed_features(
     assert chosen[2] == [2]
 
 
+def test_causal_visibility_counts_a_bounded_number_of_features(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(selectors, "_MOST_COUNTED", 20)
+    selector = selectors.CausalVisibility(SelectorSettings(name="visibility", budget=2))
+    for k in range(50):
+        new = list(range(100 + 3 * k, 103 + 3 * k))
+        selection = selector.select(_frame(k, [7, *new, 9]))
+    assert len(selector._seen._count) == 20
+    assert selection.score.tolist() == [50, 1, 1, 1, 50]
+
+
 def test_whole_record_keeps_the_first_share_of_all_features() -> None:
     # Feature k is seen in k + 1 frames; of seven features one is kept.
     record = [_frame(k, list(range(k, 7))) for k in range(7)]

@@ -13,6 +13,7 @@ from tests.frontend.test_frontend_scene import CAMERA, SLANTED, stereo_frame, tr
 from tests.guards import lines_of, messages
 from vio.frontend.klt import KltFrontend
 from vio.frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
+from vio.frontend.right_turn import RightTurn
 from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.frontend.tracks import new_tracks
 from vio.geometry.lie import FloatArray, se3_exp, transform_points
@@ -151,3 +152,71 @@ def test_front_end_matches_a_late_or_early_right_camera_as_if_it_were_on_time(
     # right image.
     first, last = (begun + 1, FRAMES) if frames_late > 0 else (begun + 3, FRAMES - 1)
     assert max(median_error(k) for k in range(first, last)) < 0.1
+
+
+def _swaying(frames: float) -> FloatArray:
+    """A pose on a way to the right, with vertical motion that comes and goes."""
+    return se3_exp([0.03 * frames, 0.02 * np.sin(0.6 * frames), 0.02 * frames, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("missing", [(), (18, 19, 23)])
+def test_depths_of_cameras_that_expose_apart_are_right_also_where_frames_are_missing(
+    missing: tuple[int, ...],
+) -> None:
+    """Half a frame late in a steady motion to the right looks like a turned camera at first; what
+    was taken out for it was left in all disparities, 1.2 px. After a missing frame, the motion
+    since the last one is that of two.
+    """
+    frontend = KltFrontend(CAMERA, FrontendSettings(grid=GridSettings(target_features=150)))
+    lines: list[str] = []
+    for k in range(27):
+        late = stereo_frame(k, _swaying(max(k - 0.5, 0.0)))
+        frame = replace(stereo_frame(k, _swaying(k)), right=late.right)
+        if k in missing:
+            continue
+        output = frontend.process(frame)
+        lines += messages(output)
+        if k < 13:
+            continue
+        seen = output.observations.take(output.observations.has_right)
+        assert len(seen) > 100, k
+        expected = truth(SLANTED, _swaying(k), seen.z[:, :2], _swaying(k))
+        assert np.median(np.abs(seen.z[:, 2] - expected[:, 2])) < 0.1, k
+    said = " ".join(lines)
+    assert "the right camera is late by 25 ms" in said
+    assert "the right camera has not turned" in said
+
+
+@pytest.mark.parametrize(("late", "most_px"), [(0.5, 0.1), (-0.5, 0.25)])
+def test_new_features_have_depths_beside_a_camera_that_exposes_earlier_or_later(
+    late: float, most_px: float
+) -> None:
+    """They are searched in the two images that were exposed nearest to one another: with the last
+    left image, where the right camera is early, two thirds had none.
+    """
+    frontend = KltFrontend(CAMERA, FrontendSettings(grid=GridSettings(target_features=150)))
+    for k in range(22):
+        right = stereo_frame(k, _swaying(max(k - late, 0.0))).right
+        output = frontend.process(replace(stereo_frame(k, _swaying(k)), right=right))
+    seen = output.observations.take(output.observations.has_right)
+    assert len(seen) > 100
+    expected = truth(SLANTED, _swaying(21), seen.z[:, :2], _swaying(21))
+    assert np.median(np.abs(seen.z[:, 2] - expected[:, 2])) < most_px
+
+
+def test_a_turn_that_no_delay_explains_stays() -> None:
+    turn = RightTurn(700.0)
+    for k in range(6):
+        turn.frame(k, 2.0, -3.0)
+    turn.take_findings()
+    assert not turn.explained(10, 0.5)
+    assert turn.take_findings() == ()
+    assert turn.explained(11, -0.6)
+    (ended,) = turn.take_findings()
+    assert ended.ended
+
+
+def test_times_between_frames_are_counted_in_usual_ones() -> None:
+    delay = RightDelay(CAMERA)
+    steps_s = [0.05, 0.051, 0.1, 0.049, 0.05, 0.1505, 0.05]
+    assert [delay.count(s) for s in steps_s] == pytest.approx([1, 1, 2, 1, 1, 3, 1], abs=0.05)

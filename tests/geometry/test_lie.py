@@ -321,3 +321,20 @@ def test_lengths_are_those_of_numpy_to_the_bit() -> None:
     np.testing.assert_array_equal(lie.lengths(vectors), np.linalg.norm(vectors, axis=1))
     for vector in np.random.default_rng(1).normal(size=(100, 3)):
         assert lie.length(vector) == np.linalg.norm(vector)
+
+
+def _integral_of_adjoints(xi: FloatArray) -> FloatArray:
+    """The left Jacobian (6, 6) of a twist (6,) as the integral of Ad(exp(s xi)) over s from 0 to 1."""
+    M = np.zeros((12, 12))
+    M[:6, :6] = lie.se3_curly_hat(xi)
+    M[:6, 6:] = np.eye(6)
+    return np.asarray(expm(M)[:6, 6:])
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0, 3.1, 6.2, 6.4, 20.0, 40.0, 300.0])
+def test_left_jacobian_of_se3_equals_its_integral_over_many_turns(angle: float) -> None:
+    """As of a rig that has turned for a minute between two frames."""
+    xi = np.concatenate([[30.0, -20.0, 10.0], angle * np.array([0.6, 0.0, -0.8])])
+    close(lie.se3_left_jacobian(xi), _integral_of_adjoints(xi), atol=1e-10)
+    others = np.stack([0.1 * xi, xi, np.zeros(6)])
+    close(lie.se3_left_jacobian(others), [_integral_of_adjoints(x) for x in others], atol=1e-10)

@@ -407,6 +407,16 @@ def test_results_after_a_reset_are_counted_where_times_begin_anew() -> None:
     assert not monitor._arrived
 
 
+def test_frames_that_never_have_a_result_are_not_kept_for_ever() -> None:
+    """As where an odometry stands still without a start, or sees nothing, for a night."""
+    monitor = LiveMonitor(judges_latency=True)
+    for k in range(30_000):
+        monitor.arrived(k)
+    assert len(monitor._arrived) <= 10_000
+    monitor.result(29_999)
+    assert monitor.results == 1
+
+
 def test_a_time_that_comes_again_is_that_of_the_newest_frame() -> None:
     """As where one camera found no start before a recording began again."""
     monitor = LiveMonitor(judges_latency=True)

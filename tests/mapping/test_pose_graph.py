@@ -28,7 +28,7 @@ from vio.geometry.lie import (
 )
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project
-from vio.mapping.builder import Keyframe, MapBuilder
+from vio.mapping.builder import Keyframe, MapBuilder, agree
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.loop_geometry import Verified, pose_of_most
 from vio.mapping.map_graph import MapGraph, _nearest
@@ -623,3 +623,50 @@ def test_points_of_a_loop_agree_within_some_pixels(off_px: float, agree: bool) -
     angle = rng.uniform(0, 2 * np.pi, 20)
     uv[20:] += off_px * np.column_stack([np.cos(angle), np.sin(angle)])
     assert (pose_of_most(camera, p, uv, 34) is not None) == agree
+
+
+def _graph_of_sessions(tmp_path: Path, sessions: int, count: int = 20) -> MapGraph:
+    """A map whose sessions drive the same way, a kilometre from where each began."""
+    graph = MapGraph(MapStore(tmp_path / "a.map", create=True))
+    P = np.diag(np.repeat([1e-4, 1e-5], 3)) ** 2
+    motion = RelativePose(se3_exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.01])), P)
+    for session in range(sessions):
+        graph.sessions.append(SessionRow(f"{session}", CAMERA, False, 0))
+        T = se3_exp(np.array([1000.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        for k in range(count):
+            drift, path_m = graph.gathered(T, motion if k else None)
+            graph.append(KeyframeRow(session, k, k, T, T, drift, path_m, None, 0.0))
+            T = T @ motion.T_i_j
+    return graph
+
+
+def test_odometry_is_as_exact_in_a_later_session_as_in_the_first(tmp_path: Path) -> None:
+    graph = _graph_of_sessions(tmp_path, 8)
+    i = np.array([0, 5, 15])
+    k = np.array([19, 6, 16])
+    first = graph.drift(i, k)
+    assert (np.linalg.eigvalsh(first) > 0).all()
+    np.testing.assert_allclose(graph.drift(140 + i, 140 + k), first, rtol=1e-6, atol=1e-16)
+    assert graph.path_m[159] == graph.path_m[19]
+
+
+def test_nothing_is_known_of_the_motion_between_sessions(tmp_path: Path) -> None:
+    graph = _graph_of_sessions(tmp_path, 3)
+    between = graph.drift(np.array([19, 0]), np.array([20, 59]), systematic=0.0)
+    assert (np.linalg.eigvalsh(between) > 1e5).all()
+
+
+def test_loops_to_the_end_of_one_session_and_the_start_of_another_must_agree(
+    tmp_path: Path,
+) -> None:
+    """Where the first session ended, the second had gathered as much path: none are neighbours."""
+    graph = _graph_of_sessions(tmp_path, 3)
+
+    def place(first: int, second: int, off_m: float) -> FoundPlace:
+        at = np.linalg.inv(graph.T_map_cam[first]) @ graph.T_map_cam[second]
+        off = se3_exp(np.array([off_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        pose = RelativePose(at @ off, 1e-4 * np.eye(6))
+        return FoundPlace(first, second, Verified(pose, 30, 40, NO_MATCHES), 1)
+
+    assert agree(graph, place(5, 45, 0.0), place(25, 46, 0.0))
+    assert not agree(graph, place(5, 45, 0.0), place(25, 46, 5.0))

@@ -41,7 +41,7 @@ def _lines(
     a mask.
     """
     report, rng, ids = RefusalReport(imu=imu), np.random.default_rng(0), np.arange(len(_PIXELS))
-    field = StereoFieldEstimate(np.zeros(8), np.eye(8), rows_px, np.zeros(7), np.eye(7))
+    field = StereoFieldEstimate(np.zeros(8), np.eye(8), rows_px, np.ones(7), 1e-4 * np.eye(7))
     lines: list[str] = []
     for k in range(40):
         gone = rng.permutation(ids[refused])[: int(share * len(ids))]

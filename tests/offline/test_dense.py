@@ -18,7 +18,7 @@ from vio.dense.occupancy import occupancy_grid
 from vio.dense.preview import preview
 from vio.dense.stereo_depth import StereoMatcher, depth_sigma_m, farthest_m, slant
 from vio.dense.surface import Mesh, extract_surface
-from vio.dense.voxel_grid import VoxelGrid, pack, unpack
+from vio.dense.voxel_grid import SIDE, VoxelGrid, pack, unpack
 from vio.files.meshes import FREE, OCCUPIED, R_GLTF_UPRIGHT, UNKNOWN, glb_mesh, ply_points
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp
@@ -53,12 +53,14 @@ def _around() -> list[FloatArray]:
     ]
 
 
-def _fused(voxel_m: float, most_blocks: int) -> Mesh:
+def _fused(voxel_m: float, most_blocks: int, blocks_away: int = 0) -> Mesh:
     tint = np.zeros((240, 320, 3), dtype=np.uint8)
     tint[:] = (200, 100, 50)
     with VoxelGrid(voxel_m, most_blocks=most_blocks) as grid:
         for T in _around():
-            grid.fuse(_sphere_depth(T), tint, CAMERA, T, 4.0)
+            depth = _sphere_depth(T)
+            T[:3, 3] += blocks_away * SIDE * voxel_m
+            grid.fuse(depth, tint, CAMERA, T, 4.0)
         assert len(grid._slot) <= max(most_blocks, 900)
         return extract_surface(grid)
 
@@ -84,6 +86,22 @@ def test_a_bounded_memory_gives_the_same_surface(sphere: Mesh) -> None:
     bounded = _fused(0.02, 64)
     np.testing.assert_array_equal(bounded.vertices, sphere.vertices)
     np.testing.assert_array_equal(bounded.triangles, sphere.triangles)
+
+
+@pytest.mark.parametrize("kilometres", [-100, 30])
+def test_a_surface_far_away_is_that_of_the_same_views_here(sphere: Mesh, kilometres: int) -> None:
+    far = _fused(0.02, 100_000, blocks_away=round(kilometres * 1000 / (SIDE * 0.02)))
+    assert len(far.triangles) == pytest.approx(len(sphere.triangles), rel=0.01)
+    corners = far.vertices[far.triangles].astype(np.float64)
+    assert np.ptp(corners, axis=1).max() < 0.1  # triangles of neighbouring cells
+
+
+def test_what_is_farther_than_blocks_can_be_numbered_is_left_out() -> None:
+    T = np.eye(4)
+    T[:3, 3] = (1 << 20) * SIDE * 0.02
+    with VoxelGrid(0.02) as grid:
+        grid.fuse(_sphere_depth(np.eye(4)), np.zeros((240, 320), np.uint8), CAMERA, T, 4.0)
+        assert len(grid) == 0
 
 
 def test_packs_block_coordinates_in_their_order() -> None:

@@ -6,9 +6,12 @@ import csv
 import json
 import shutil
 import time
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
+from unittest.mock import MagicMock, patch
 
 import numpy as np
 import pytest
@@ -249,3 +252,15 @@ def test_findings_of_the_live_run_are_kept(
     kept = read_finished_run(tmp_path / "out").metrics["findings"]
     assert kept == [finding.to_json() for finding in findings]
     assert kept
+
+
+def test_frames_given_before_a_reset_have_their_times_in_the_trajectory_after_it() -> None:
+    """Frames that wait in the queue at a reset are those of the next trajectory."""
+    folder = MagicMock()
+    folder._recent = deque(maxlen=0)
+    folder._trajectory.times_ns = {}
+    log = SimpleNamespace(index=7, time_ns=123)
+    frame = SimpleNamespace(left=None, right=None, depth=None)
+    with patch("vio.runs.live_folder.replace", lambda record, **_: record):
+        LiveFolder.frame(folder, cast(Any, SimpleNamespace(log=log, frame=frame)), MagicMock())
+    assert _times_ns(folder._trajectory.times_ns, 7)[7] == 123

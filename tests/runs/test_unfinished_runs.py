@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import threading
+import tracemalloc
 import zlib
 from collections import deque
 from collections.abc import Callable
@@ -45,7 +46,7 @@ from vio.runs.folder import growing_folder
 from vio.runs.pipeline import RunControl, RunResult, run
 from vio.runs.recorder import GrowingFolder, RunRecorder
 from vio.runs.stated import RunRequest
-from vio.runs.tables import estimate_of, estimate_row
+from vio.runs.tables import ESTIMATE, FRAME, estimate_of, estimate_row
 from vio.sim.effects import CLEAN
 from vio.sim.imu import ImuNoise
 from vio.sim.motion import hand_held
@@ -839,3 +840,37 @@ def test_a_damaged_or_foreign_checkpoint_is_refused(
     path.write_bytes(spoil(path.read_bytes()))
     with pytest.raises(DataError, match="repeat the run from its start"):
         load_checkpoint(path, dataset)
+
+
+@pytest.mark.parametrize("effect", ["scale", "share"])
+def test_marks_of_a_long_run_do_not_copy_it(tmp_path: Path, effect: str) -> None:
+    count = 20_000
+    recorder = RunRecorder(
+        "imu", lag_frames=0, keep_observations=False, folder=GrowingFolder(tmp_path / "out", {})
+    )
+    recorder._begin()
+    rows = np.zeros(count, dtype=ESTIMATE)
+    rows["index"] = 10 + np.arange(count)
+    rows["time_ns"] = np.arange(count) * 50_000_000
+    rows["T_world_imu"] = np.eye(4)
+    rows["T_world_imu"][:, 0, 3] = 0.1 * np.arange(count)
+    rows["covariance"] = 1e-4 * np.eye(6)
+    recorder._tables["estimates"].append(rows)
+    frames = np.zeros(count, dtype=FRAME)
+    frames["index"] = rows["index"]
+    recorder._tables["frames"].append(frames)
+    mark = Mark(count - 20, count - 10, "degraded", "imu-disagrees", **{effect: 0.1})
+    tracemalloc.start()
+    recorder.mark([mark])
+    recorder.replace({count: recorder.estimates[count - 10]})
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < rows.nbytes / 10
+    sigma_m = np.sqrt(recorder._tables["estimates"].rows()["covariance"][:, 0, 0])
+    for table in recorder._tables.values():
+        table.close()
+    changed = np.flatnonzero(sigma_m > 0.0101)
+    first = count - 30 + (effect == "share")  # where the time since begins
+    assert (changed[0], changed[-1]) == (first, count - 21)
+    far_m = 0.1 * (count - 21) if effect == "scale" else 0.1 * 9
+    assert sigma_m[count - 21] == pytest.approx(np.hypot(0.01, 0.1 * far_m))

@@ -42,6 +42,7 @@ def extract_surface(grid: VoxelGrid, *, least_seen: int = _MIN_SEEN) -> Mesh:
     points = []
     colours = []
     quads = []
+    blocks = grid.keys()
     for first, block in grid.padded():
         if not (block["seen"] >= least_seen).any():
             continue
@@ -55,10 +56,10 @@ def extract_surface(grid: VoxelGrid, *, least_seen: int = _MIN_SEEN) -> Mesh:
             first,
             _Pieces(cell, point, colour, quad),
         )
-        keys.append(pack(cell[:vertices]))
+        keys.append(_cell_keys(blocks, cell[:vertices]))
         points.append(grid.voxel_m * point[:vertices])
         colours.append(colour[:vertices].copy())
-        quads.append(pack(quad[:faces].reshape(-1, 3)).reshape(-1, 4))
+        quads.append(_cell_keys(blocks, quad[:faces].reshape(-1, 3)).reshape(-1, 4))
     if not any(map(len, quads)):
         none = np.zeros((0, 3), dtype=np.float32)
         return Mesh(none, none, none.astype(np.uint8), none.astype(np.uint32))
@@ -67,6 +68,16 @@ def extract_surface(grid: VoxelGrid, *, least_seen: int = _MIN_SEEN) -> Mesh:
     corners = order[np.searchsorted(key[order], np.concatenate(quads))]
     triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
     return _tidied(np.concatenate(points).astype(np.float32), np.concatenate(colours), triangles)
+
+
+def _cell_keys(blocks: IntArray, cells: IntArray) -> IntArray:
+    """Return one whole number (N,) for cells (N, 3) of blocks with sorted keys (B,): by the place of
+    the block, as the cells of a long drive are too many for `pack`.
+    """
+    inner = cells % SIDE
+    block = np.searchsorted(blocks, pack(cells // SIDE))
+    out: IntArray = ((block * SIDE + inner[:, 0]) * SIDE + inner[:, 1]) * SIDE + inner[:, 2]
+    return out
 
 
 def _tidied(

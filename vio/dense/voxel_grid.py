@@ -42,7 +42,7 @@ BLOCK = np.dtype(
 
 
 def pack(blocks: npt.NDArray[np.int64]) -> IntArray:
-    """Return one whole number (N,) for block or cell coordinates (N, 3)."""
+    """Return one whole number (N,) for block coordinates (N, 3), which are within `_HALF`."""
     shifted = blocks + _HALF
     out: IntArray = (shifted[:, 0] << 42) | (shifted[:, 1] << 21) | shifted[:, 2]
     return out
@@ -199,7 +199,9 @@ class VoxelGrid:
         ):
             along = z + offset * self.truncation_m / np.linalg.norm(rays, axis=1)
             points = transform_points(T_world_cam, rays * along[:, None])
-            found.append(pack(np.floor(points / edge_m).astype(np.int64)))
+            blocks = np.floor(points / edge_m)
+            within = (np.abs(blocks) < _HALF - 1).all(axis=1)  # and those beside them
+            found.append(pack(blocks[within].astype(np.int64)))
         return np.unique(np.concatenate(found))
 
     def _slots(self, keys: IntArray, centre: FloatArray) -> IntArray:

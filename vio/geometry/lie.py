@@ -364,10 +364,16 @@ def se3_adjoint(T: npt.ArrayLike) -> FloatArray:
 def se3_left_jacobian(xi: npt.ArrayLike) -> FloatArray:
     """Left Jacobian of SE(3), (..., 6, 6): exp(xi + d) = exp(J d) exp(xi) to first order in d.
 
-    Summed as a power series in the curly hat, which converges for every twist; for one step of
-    motion a few terms suffice. Reference: Barfoot (2017), equation 7.83.
+    Summed as a power series in the curly hat; for one step of motion a few terms suffice. Digits
+    of the series cancel beyond some turns: there, that of a fraction of the twist is doubled by
+    `J(2 xi) = (1 + Ad(exp(xi))) J(xi) / 2`. Reference: Barfoot (2017), equation 7.83.
     """
-    curly = se3_curly_hat(xi)
+    xi = np.asarray(xi, dtype=np.float64)
+    angle = float(np.linalg.norm(xi[..., 3:], axis=-1).max(initial=0.0))
+    halvings = 0
+    if 2 * np.pi < angle < np.inf:
+        halvings = math.ceil(math.log2(angle / np.pi))
+    curly = se3_curly_hat(xi / 2**halvings)
     term = np.broadcast_to(np.eye(6), curly.shape)
     total = term.copy()
     for n in range(2, 60):
@@ -375,6 +381,9 @@ def se3_left_jacobian(xi: npt.ArrayLike) -> FloatArray:
         total += term
         if np.abs(term).max(initial=0.0) < 1e-16:
             break
+    for k in range(halvings, 0, -1):
+        A = se3_adjoint(se3_exp(xi / 2**k))
+        total = 0.5 * (np.eye(6) + A) @ total
     return total
 
 

@@ -19,6 +19,8 @@ class _FigureRules(NamedTuple):
     """When a computer is too slow."""
 
     kept_results: Capacity[int] = 1000  # results that the median and the bound of 95 % are taken of
+    # frames without a result, of which the oldest are forgotten: more than a queue has memory for
+    kept_arrivals: Capacity[int] = 10_000
     # results older than that, one after another, mean that the computer is too slow
     late_s: float = 0.5
     late_results: int = 10
@@ -67,7 +69,7 @@ class LiveMonitor:
         """
         self._judges = judges_latency
         # time of the frame, ns, and of its arrival, s
-        self._arrived: deque[tuple[int, float]] = deque()
+        self._arrived = deque[tuple[int, float]](maxlen=_FIGURES.kept_arrivals)
         self._lock = threading.Lock()  # of these
         self._latencies_s: deque[float] = deque(maxlen=_FIGURES.kept_results)
         self._left_out: deque[bool] = deque(maxlen=100)

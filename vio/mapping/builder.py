@@ -520,7 +520,8 @@ def agree(graph: MapGraph, a: FoundPlace, b: FoundPlace) -> bool:
     A = se3_adjoint(se3_inverse(T_second))
     C = A @ a.seen.pose.covariance @ A.T + b.seen.pose.covariance
     C = C + graph.drift(np.array([a.second]), np.array([b.second]))[0]
-    if abs(graph.path_m[a.first] - graph.path_m[b.first]) < _SETTLING.neighbours_m:
+    apart_m = abs(graph.path_m[a.first] - graph.path_m[b.first])
+    if graph.session[a.first] == graph.session[b.first] and apart_m < _SETTLING.neighbours_m:
         C = C + graph.drift(np.array([a.first]), np.array([b.first]))[0]
     return squared(r, C) < GATE
 

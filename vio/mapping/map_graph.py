@@ -180,25 +180,23 @@ class MapGraph:
         self, T_odom_cam: FloatArray, motion: RelativePose | None
     ) -> tuple[FloatArray, float]:
         """Return the covariance (6, 6) and the path that the odometry has gathered at a new
-        keyframe.
+        keyframe since its session began; no motion: it begins.
 
         The covariance is that of right-invariant errors, which add up:
-        `xi_k = xi_i + Ad(T_k) xi_i_k`. From session to session it grows by `UNKNOWN`.
+        `xi_k = xi_i + Ad(T_k) xi_i_k`. What other sessions have gathered is not part of the sum, as
+        its digits would be missing in the differences.
         """
-        before = (
-            (self._drift.rows[-1], float(self.path_m.rows[-1]))
-            if len(self)
-            else (np.zeros((6, 6)), 0.0)
-        )
         if motion is None:
-            return before[0] + (UNKNOWN if len(self) else 0.0) * np.eye(6), before[1]
+            return np.zeros((6, 6)), 0.0
         A = se3_adjoint(T_odom_cam)
         moved = float(np.linalg.norm(motion.T_i_j[:3, 3]))
-        return before[0] + A @ motion.covariance @ A.T, before[1] + moved
+        return self._drift.rows[-1] + A @ motion.covariance @ A.T, float(
+            self.path_m.rows[-1]
+        ) + moved
 
     def drift(self, i: IntArray, k: IntArray, *, systematic: float = 1.0) -> FloatArray:
         """Covariance (N, 6, 6) of the motion between keyframes i and k (N,) along the path, in the
-        frame of the later.
+        frame of the later; `UNKNOWN` from one session to another.
 
         Args:
             i: keyframes.
@@ -210,6 +208,8 @@ class MapGraph:
         A = se3_adjoint(se3_inverse(self.T_odom_cam[late]))
         between = self._drift[late] - self._drift[early]
         C: FloatArray = A @ between @ np.swapaxes(A, 1, 2)
+        session = self.session
+        C[session[late] != session[early]] = UNKNOWN * np.eye(6)
         if systematic:
             path = (self.path_m[late] - self.path_m[early])[:, None]
             sigma = systematic * path * np.repeat([_DRIFT_SHARE, _DRIFT_RAD_PER_M], 3)

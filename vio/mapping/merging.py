@@ -26,7 +26,7 @@ from vio.geometry.lie import se3_adjoint, se3_inverse, se3_log
 from vio.mapping.builder import CONFIRM_WITHIN, agree, check_sessions, join_parts
 from vio.mapping.files import describe_map, new_map
 from vio.mapping.map_database import check_path
-from vio.mapping.map_graph import UNKNOWN, MapGraph
+from vio.mapping.map_graph import MapGraph
 from vio.mapping.map_store import LoopRow, MapStore
 from vio.mapping.place_finder import FoundPlace, PlaceFinder
 from vio.numerics.threads import start_worker
@@ -115,17 +115,11 @@ def _append(other: MapStore, store: MapStore, first: Path) -> None:
     sessions = len(store.sessions())
     rows = store.keyframes()
     loops = other.loops()
-    drift, path_m = (
-        (rows[-1].drift + UNKNOWN * np.eye(6), rows[-1].path_m) if rows else (np.zeros((6, 6)), 0.0)
-    )
     for session in other.sessions():
         check_sessions(store, session.camera, f"{other.path}", place=first)
         store.add_session(replace(session, part=session.part + sessions))
     for k, row in enumerate(other.keyframes()):
-        moved = replace(
-            row, session=row.session + sessions, drift=row.drift + drift, path_m=row.path_m + path_m
-        )
-        store.add_keyframe(moved, other.features(k))
+        store.add_keyframe(replace(row, session=row.session + sessions), other.features(k))
     for i, j, motion in other.odometry():
         store.add_odometry(len(rows) + i, len(rows) + j, motion)
     for loop in loops:

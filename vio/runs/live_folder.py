@@ -138,6 +138,8 @@ class LiveFolder:
 
     def frame(self, result: FrameResult, odometry: Odometry) -> None:
         """Take the result of a frame."""
+        # a frame that was given before a reset is another trajectory's there
+        self._trajectory.times_ns[result.log.index] = result.log.time_ns
         late: dict[int, Estimate] = {}
         if self._recent and len(self._recent) == self._recent.maxlen:
             late = _smoothed(odometry, [self._recent[0]])

@@ -7,6 +7,7 @@ process that dies leaves all but the last second of it readable.
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import logging
 import os
@@ -32,7 +33,6 @@ from vio.protocols import Dataset
 from vio.records import (
     NS_PER_S,
     BodyFrame,
-    BoolArray,
     Estimate,
     FrameLog,
     FrameResult,
@@ -213,12 +213,13 @@ class RunRecorder:
             return
         table = self._tables["estimates"]
         with self._writing():
-            known = table.rows()["index"].tolist()
-            rows = [k for k, index in enumerate(known) if index in estimates]
+            known = table.rows()
+            places = {_place(known, index): index for index in sorted(estimates)}
+            rows = [k for k, i in places.items() if k < len(known) and known["index"][k] == i]
             self._keep_rows("estimates", rows)
             self._keep_rows("frames", rows)
             for k in rows:
-                self._replace(k, known[k], estimates[known[k]])
+                self._replace(k, places[k], estimates[places[k]])
         self._written = 0
         self._saved_s = -np.inf  # the last checkpoint is that of other rows
 
@@ -229,15 +230,14 @@ class RunRecorder:
         estimates = self._tables["estimates"]
         with self._writing():
             for mark in marks:
-                rows = np.array(estimates.rows())
-                held = (rows["index"] >= mark.since) & (rows["index"] < mark.before)
+                rows = estimates.rows()  # not copied: those of an hour are hundreds of megabytes
+                held = range(_place(rows, mark.since), _place(rows, mark.before))
                 sigma_m = _may_be_off_m(rows, held, mark)
-                marked_rows = np.flatnonzero(held).tolist()
-                self._keep_rows("estimates", marked_rows)
-                self._keep_rows("frames", marked_rows)
-                for k in marked_rows:
-                    estimate = marked(estimate_of(rows[k]), mark, sigma_m[k])
-                    self._replace(k, int(rows["index"][k]), estimate)
+                self._keep_rows("estimates", held)
+                self._keep_rows("frames", held)
+                for k, more_m in zip(held, sigma_m.tolist(), strict=True):
+                    estimate = marked(estimate_of(rows[k]), mark, more_m)
+                    self._replace(k, int(rows[k]["index"]), estimate)
         self._written = 0
         self._saved_s = -np.inf  # the last checkpoint is that of other rows
 
@@ -492,24 +492,32 @@ class RunRecorder:
                 os.fsync(stream.fileno())
 
 
-def _may_be_off_m(rows: Rows, held: BoolArray, mark: Mark) -> FloatArray:
-    """What the positions of estimates (N,) may be off by more, as a mark of some of them (N,) says."""
-    if not held.any():
-        return np.zeros(len(rows))
+def _place(rows: Rows, index: int) -> int:
+    """The first of the estimates (N,) of a frame with that number or a later one."""
+    return bisect.bisect_left(rows, index, key=lambda row: int(row["index"]))
+
+
+def _may_be_off_m(rows: Rows, held: range, mark: Mark) -> FloatArray:
+    """What the positions of a range (M,) of estimates (N,) may be off by more, as a mark of them says."""
+    if not held or not (mark.scale > 0.0 or mark.share > 0.0):
+        return np.zeros(len(held))
+    own = rows[held.start : held.stop]
     if mark.scale > 0.0:
-        position = rows["T_world_imu"][:, :3, 3]
-        return np.asarray(mark.scale * np.linalg.norm(position - position[0], axis=1))
-    elapsed_s = (rows["time_ns"] - rows["time_ns"][held][0]) / NS_PER_S
+        position = own["T_world_imu"][:, :3, 3]
+        begin = rows[0]["T_world_imu"][:3, 3]
+        return np.asarray(mark.scale * np.linalg.norm(position - begin, axis=1))
+    elapsed_s = (own["time_ns"] - own["time_ns"][0]) / NS_PER_S
     return np.asarray(mark.share * _fastest_mps(rows) * elapsed_s)
 
 
 def _fastest_mps(rows: Rows) -> float:
     """The largest speed between the estimates (N,) of frames that may be used."""
-    usable = rows[rows["integrity"] < INTEGRITIES.index("unusable")]
-    if len(usable) < 2:
+    usable = rows["integrity"] < INTEGRITIES.index("unusable")
+    if np.count_nonzero(usable) < 2:
         return 0.0
-    steps_m = np.linalg.norm(np.diff(usable["T_world_imu"][:, :3, 3], axis=0), axis=1)
-    return float(np.max(steps_m / (np.diff(usable["time_ns"]) / NS_PER_S)))
+    position = rows["T_world_imu"][:, :3, 3][usable]
+    steps_m = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    return float(np.max(steps_m / (np.diff(rows["time_ns"][usable]) / NS_PER_S)))
 
 
 def _claim(folder: GrowingFolder) -> None:

@@ -8,6 +8,7 @@ camera's motion. docs/notes/selection.md compares them.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import ClassVar, Literal, NamedTuple
 
@@ -17,6 +18,7 @@ from vio.dataclass import dataclass
 from vio.errors import ConfigError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.kinds import Capacity
 from vio.protocols import Selector
 from vio.records import BoolArray, IntArray, MotionPrior, Observations, Selection
 from vio.selection.information import (
@@ -38,6 +40,8 @@ class _SelectionRules(NamedTuple):
 
 
 _SELECTION = _SelectionRules()
+# features whose observations are counted, 20 MB; a live run has no end
+_MOST_COUNTED: Capacity[int] = 100_000
 
 SelectorName = Literal["all", "visibility", "visibility_whole", "information"]
 
@@ -66,14 +70,20 @@ class _VisibilityCount:
     """Counts the frames in which each feature has been observed."""
 
     def __init__(self) -> None:
-        self._count: dict[int, int] = {}
+        self._count: OrderedDict[int, int] = OrderedDict()  # the newest observed last
 
     def add(self, ids: IntArray) -> FloatArray:
         """Count one more observation of each id (N,) and return the counts (N,)."""
         count = self._count
         for i in ids.tolist():
             count[i] = count.get(i, 0) + 1
+            count.move_to_end(i)
         return np.array([count[i] for i in ids.tolist()], dtype=np.float64)
+
+    def forget(self, most: int) -> None:
+        """Forget the ids that were not observed for longest, all but so many."""
+        while len(self._count) > most:
+            self._count.popitem(last=False)
 
     def ranked_ids(self) -> list[int]:
         """Return all ids, most often observed first; ties by id, so that the order is
@@ -118,6 +128,7 @@ class CausalVisibility:
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose the most often observed rows; ties go to the older feature."""
         score = self._seen.add(observations.ids)
+        self._seen.forget(_MOST_COUNTED)
         chosen = _best(self._settings, score, observations.ids)
         return Selection(chosen, score, f"most seen so far, {chosen.sum()} of {len(score)}")
 
