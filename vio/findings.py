@@ -223,7 +223,7 @@ CODES: dict[str, Code] = {
     ),
     "rig-in-view": Code(
         "unusable",
-        "parts of the rig are taken for the scene, or something moves around a rig at standstill",
+        "parts of the rig, or what moves before the scene, may be taken for it",
         "mask the rig (frontend.klt.mask)",
     ),
     "tracks-disagree": Code(

@@ -243,6 +243,60 @@ def test_parts_of_the_rig_all_around_a_scene_that_moves_are_no_scene() -> None:
             assert not _see(check, k, scene(200, k, FAR), near, (motion, REST))
 
 
+AHEAD = se3_exp([0.0, 0.0, -0.2, 0.0, 0.0, 0.0])  # a lorry that is slower than the rig
+
+
+def _centre(p: FloatArray) -> FloatArray:
+    """Points (N, 3) in the middle third of the view."""
+    return p * [1.0 / 3.0, 1.0 / 3.0, 1.0]
+
+
+def _beside(
+    other: FloatArray,
+    frames: range,
+    check: RigInView,
+    first: tuple[FloatArray, FloatArray] = (_centre(scene(200, 1, (4.0, 6.0))), AHEAD),
+    motion: FloatArray = STEP,
+) -> list[tuple[int | None, bool]]:
+    """Findings on frames whose consensus is that of the first points and their motion, beside others
+    (N, 3) and theirs.
+    """
+    found = []
+    for k in frames:
+        found += _see(check, k, first[0], other, (first[1], motion))
+    return [(f.frame, f.ended) for f in found]
+
+
+def test_what_moves_before_a_scene_that_moves_otherwise_is_named() -> None:
+    """As a lorry ahead from the first frame on."""
+    check = RigInView()
+    around = scene(40, 2, (4.0, 6.0))
+    assert _beside(around, range(1, 20), check) == [(5, False)]
+    assert _beside(around[:12], range(20, 40), check) == []  # few tell that it goes on
+    assert _beside(NONE, range(40, 60), check) == [(49, True)]
+
+
+def test_some_points_that_move_otherwise_are_no_scene() -> None:
+    around = scene(40, 2, (4.0, 6.0))
+    for other in (around[:11], _centre(around), _centre(scene(40, 2, (2.0, 3.0)))):
+        assert _beside(other, range(1, 30), RigInView()) == []
+
+
+def test_what_moves_far_off_in_a_part_of_a_view_that_moves_is_an_object() -> None:
+    """As cars ahead of what a rig drives by."""
+    for k in range(1, 30):
+        cars = _centre(scene(40, k, (30.0, 40.0)))
+        ground = scene(200, k, CLOSE), STEP
+        assert _beside(cars, range(1, 20), RigInView(), ground, AHEAD) == []
+
+
+def test_points_that_leave_the_motion_by_little_are_of_the_scene() -> None:
+    """As by wrong disparities, which make near and far ones move apart."""
+    around = scene(40, 2, (4.0, 6.0))
+    more = se3_exp([0.0, 0.0, -0.21, 0.0, 0.0, 0.0])
+    assert _beside(around, range(1, 30), RigInView(), motion=more) == []
+
+
 def _replaced(
     before: FloatArray,
     after: FloatArray,
