@@ -24,7 +24,7 @@ def _pixels(xy: FloatArray) -> FloatArray:
     return xy * [CAMERA.fu, CAMERA.fv] + [CAMERA.cu, CAMERA.cv]
 
 
-def _radial(k1: float, k2: float = 0.0) -> Lens:
+def radial(k1: float, k2: float = 0.0) -> Lens:
     def distorted(xy: FloatArray) -> FloatArray:
         squared = (xy**2).sum(axis=1, keepdims=True)
         return xy * (1.0 + k1 * squared + k2 * squared**2)
@@ -46,7 +46,7 @@ def _same(xy: FloatArray) -> FloatArray:
     return xy
 
 
-def _frames(
+def frames_seen(
     left: Lens, right: Lens, count: int = 40, flat: bool = False, features: int = 150
 ) -> list[Observations]:
     """Frames of points at depths of 0.8 to 20 m, or on a wall, with wrong matches among them."""
@@ -74,15 +74,15 @@ def _found(frames: Sequence[Observations]) -> list[Finding]:
 @pytest.mark.parametrize("rotation", [(0.0, 0.0, 0.0), (0.004, -0.003, 0.006)])
 def test_distortion_of_both_lenses_is_found_once(k1: float, rotation: Sequence[float]) -> None:
     turned = _turned(rotation)
-    lens = _radial(k1)
-    (finding,) = _found(_frames(lens, lambda xy: turned(lens(xy)), 200))
+    lens = radial(k1)
+    (finding,) = _found(frames_seen(lens, lambda xy: turned(lens(xy)), 200))
     assert (finding.code, finding.frame, finding.lasts) == ("other-calibration", 19, True)
     assert finding.figures["distorted_share"] * k1 > 0.0
 
 
 HEALTHY: dict[str, tuple[Lens, Lens]] = {
     "calibrated": (_same, _same),
-    "residual distortion": (_radial(0.02, -0.005), _radial(0.02, -0.005)),
+    "residual distortion": (radial(0.02, -0.005), radial(0.02, -0.005)),
     "rolled": (_same, _turned((0.0, 0.0, 0.02))),
     "pitched": (_same, _turned((0.02, 0.0, 0.0))),
     "toed in": (_same, _turned((0.0, 0.02, 0.0))),
@@ -93,30 +93,30 @@ HEALTHY: dict[str, tuple[Lens, Lens]] = {
 
 @pytest.mark.parametrize("name", HEALTHY)
 def test_other_errors_of_a_calibration_are_none(name: str) -> None:
-    assert _found(_frames(*HEALTHY[name], count=200)) == []
+    assert _found(frames_seen(*HEALTHY[name], count=200)) == []
 
 
 @pytest.mark.parametrize("name", HEALTHY)
 def test_nor_are_they_before_a_wall(name: str) -> None:
-    assert _found(_frames(*HEALTHY[name], count=200, flat=True)) == []
+    assert _found(frames_seen(*HEALTHY[name], count=200, flat=True)) == []
 
 
 def test_too_few_matches_tell_nothing() -> None:
-    lens = _radial(-0.3)
-    assert _found(_frames(lens, lens, features=8)) == []
-    assert _found(_frames(lens, lens, count=19)) == []
+    lens = radial(-0.3)
+    assert _found(frames_seen(lens, lens, features=8)) == []
+    assert _found(frames_seen(lens, lens, count=19)) == []
 
 
 def test_distortion_is_found_after_frames_without_matches() -> None:
-    lens = _radial(-0.1)
-    frames = _frames(lens, lens)
+    lens = radial(-0.1)
+    frames = frames_seen(lens, lens)
     blind = [observations(o.frame_index, o.time_ns, [], np.zeros((0, 4))) for o in frames[:30]]
     assert [f.frame for f in _found([*blind, *frames])] == [19]
 
 
 def test_what_is_kept_does_not_grow() -> None:
     check = LensCheck(CAMERA)
-    for o in _frames(_same, _same, 500, features=20):
+    for o in frames_seen(_same, _same, 500, features=20):
         check.frame(o)
         assert len(check._matches) <= 20
     assert check.done

@@ -24,11 +24,13 @@ from tests.dataset_makers import FRAME_S, make_kitti
 from tests.euroc_maker import RADTAN_RIG
 from tests.frontend.test_frontend_scene import CAMERA
 from tests.guard.test_guard import shifted
+from tests.monitor import test_lens_distortion
 from tests.plain_maker import make_plain, rig_of
 from vio.cli import main
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageRecording
 from vio.frontend import build_frontend
+from vio.frontend.precomputed import PrecomputedFrontend
 from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.geometry.lie import so3_exp
 from vio.guard.guarded import guarded
@@ -334,6 +336,23 @@ def test_pairs_of_different_times_are_named(delay: int, named: str | None) -> No
     faults = [fault for part in parts if part.name == "pairs" for fault in part.faults]
     assert len(faults) == (named is not None)
     assert named is None or faults[0].startswith(named)
+
+
+@pytest.mark.parametrize("k1", [-0.1, 0.0])
+def test_pixels_that_are_still_distorted_are_named(k1: float) -> None:
+    lens = test_lens_distortion.radial(k1)
+    seen = test_lens_distortion.frames_seen(lens, lens, 25)
+    camera = test_lens_distortion.CAMERA
+    frames = [StereoFrame(o.frame_index, o.time_ns, None, None) for o in seen]
+    recording = SimpleNamespace(camera=camera, motion=(), T_cam0_imu=None)
+    dataset: Any = SimpleNamespace(recording=recording, events=lambda *span: iter(frames))
+    source = PrecomputedFrontend(lambda index: seen[index])
+    tracked = _track(dataset, source, range(len(frames)), lambda done, total: None)
+    parts = _tracking_parts(dataset.recording, tracked)
+    faults = [fault for part in parts if part.name == "lenses" for fault in part.faults]
+    assert [fault.startswith("rows of near and far points") for fault in faults] == [True] * bool(
+        k1
+    )
 
 
 # --- figures

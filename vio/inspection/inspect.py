@@ -26,6 +26,7 @@ from vio.inspection.finding import Inspection, Part
 from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
 from vio.inspection.pictures import calibration_part, depths_part, images_part, rows_part
 from vio.monitor.inertial import InertialCheck
+from vio.monitor.lens_distortion import lens_check
 from vio.monitor.reading import pair_as_read
 from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import robust_sigma
@@ -242,6 +243,9 @@ def _tracking_parts(recording: Recording, seen: _Tracked) -> list[Part]:
     parts = [_tracked_part(seen, mono=mono)]
     if seen.shifted:
         parts.append(Part("pairs", "of different times", {"shifted": True}, seen.shifted))
+    if seen.lenses is not None:
+        fault = seen.lenses.message.partition(": ")[2]
+        parts.append(Part("lenses", "pixels are distorted", seen.lenses.figures, [fault]))
     if "imu" in recording.motion and recording.T_cam0_imu is not None:
         parts.append(_imu_part(seen.imu_findings, mono=mono))
     return parts
@@ -255,6 +259,7 @@ class _Tracked:
     tracked: list[int] = field(default_factory=list)  # features from the frame before, per frame
     matched: list[int] = field(default_factory=list)  # features with depth, per frame
     shifted: list[str] = field(default_factory=list)  # findings about the pairs
+    lenses: Finding | None = None  # that pixels are distorted
     imu_findings: list[str] = field(default_factory=list)
 
 
@@ -268,6 +273,7 @@ def _track(
     if "imu" in recording.motion and recording.T_cam0_imu is not None:
         check = InertialCheck(recording.camera, recording.T_cam0_imu)
     seen = _Tracked(VerticalDisparityModel(recording.camera))
+    lenses = lens_check(recording.camera)
     for event in dataset.events(frames.start, frames.stop):
         if isinstance(event, StereoFrame):
             output = frontend.process(event)
@@ -277,6 +283,8 @@ def _track(
             progress(len(seen.tracked), len(frames))
             if recording.camera.kind == "stereo":
                 seen.rows.update(output.observations)
+            if lenses is not None:
+                seen.lenses = seen.lenses or lenses.frame(output.observations)
             if check is not None:
                 seen.imu_findings += _messages(check.frame(output.observations), mono=mono)
         elif check is not None and isinstance(event, ImuSample):

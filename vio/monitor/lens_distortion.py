@@ -44,6 +44,12 @@ _RIDGE = 1e-9  # of terms that a scene does not show
 _CODE = "other-calibration"
 
 
+def lens_check(camera: StereoCamera) -> LensCheck | None:
+    """Return the check of a rectified pair; None: one camera, or one of another projection."""
+    is_pair = camera.kind == "stereo" and not camera.is_cylinder
+    return LensCheck(camera) if is_pair else None
+
+
 class LensCheck:
     """Asks after some frames of a run whether their pixels are distorted."""
 

@@ -22,7 +22,7 @@ from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import OF_THE_STATE, IntegrityMonitor, Mark
-from vio.monitor.lens_distortion import LensCheck
+from vio.monitor.lens_distortion import LensCheck, lens_check
 from vio.monitor.still_features import StillFeatures
 from vio.monitor.update_checks import UpdateChecks, UpdatedFrame
 from vio.records import (
@@ -75,8 +75,7 @@ class RunMonitor:
         self._image: Image | None = None  # left one of the present frame
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
-        is_pair = camera.kind == "stereo" and camera.projection == "pinhole"
-        self._lenses = LensCheck(camera) if is_pair else None
+        self._lenses = lens_check(camera)
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
         self._faults = ImuFaultReport() if imu else None
