@@ -237,7 +237,7 @@ class RightMatcher:
         left_half = images.left.half
         right_half = right.half
         points = tracks.left
-        if delay > 0.0:
+        if delay > 0.5:
             left_half = previous.left.half
             points = tracks.left - flow
         elif delay < -0.5 and previous.right_half is not None:

@@ -91,6 +91,24 @@ def test_a_run_follows_the_drive(tmp_path: Path) -> None:
     assert evaluate(result.trajectory, truth).ate_m.rmse < 0.01  # exact pixels over 7 m
 
 
+@pytest.mark.parametrize(("mode", "are_checked"), [("auto", True), ("literal", False)])
+def test_factors_that_repeat_are_taken_as_they_are_on_request(
+    mode: str, are_checked: bool, tmp_path: Path
+) -> None:
+    path = make_factors(tmp_path)
+    rows = [line.split() for line in path.read_text().splitlines()]
+    at = {(int(row[0]), row[1]): row for row in rows}
+    out = []
+    for frame, landmark in at:
+        even = frame - (frame - FIRST) % 2
+        if (even, landmark) in at:
+            out.append(" ".join([str(frame), *at[even, landmark][1:]]))
+    path.write_text("\n".join(out))
+    config = load_config(overrides=[f"dataset.repeated_tracks={mode}"])
+    result = run(open_dataset(path, config.dataset), config)
+    assert any(frame.stale > 0 for frame in result.frames) is are_checked
+
+
 def _with(change: Callable[[list[str]], list[str]], name: str = FACTORS) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         folder.mkdir(exist_ok=True)

@@ -33,7 +33,7 @@ from vio.frontend import build_frontend
 from vio.frontend.precomputed import PrecomputedFrontend
 from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.geometry.lie import so3_exp
-from vio.guard.guarded import guarded
+from vio.guard.guarded import GuardedFrontend, guarded
 from vio.inspection.inertial import allan_deviation, noise_part, rest_part
 from vio.inspection.inspect import (
     _pairs_parts,
@@ -44,7 +44,7 @@ from vio.inspection.inspect import (
     inspect_recording,
 )
 from vio.inspection.pictures import GrayLevels, _image_faults, rows_part
-from vio.records import Event, ImuDensities, ImuRecord, StereoFrame
+from vio.records import Event, FrontendOutput, ImuDensities, ImuRecord, StereoFrame
 
 
 def inspect(
@@ -69,6 +69,26 @@ def test_a_sound_recording(flight: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert parts["rest"]["force_norm_mps2"] == pytest.approx(9.8, abs=0.5)
     assert parts["tracking"]["tracked_median"] > 50
     assert parts["missing"]["missing"] == []
+
+
+def test_tracks_without_the_checks_on_request(
+    flight: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the run does that the settings are of."""
+    checked = []
+    process = GuardedFrontend.process
+
+    def counted(self: GuardedFrontend, *args: Any) -> FrontendOutput:
+        checked.append(args)
+        return process(self, *args)
+
+    monkeypatch.setattr(GuardedFrontend, "process", counted)
+    inspect(flight, capsys)
+    assert checked
+    checked.clear()
+    _, facts = inspect(flight, capsys, "--set", "frontend.checks=false")
+    assert facts["parts"]["tracking"]["tracked_median"] > 50
+    assert not checked
 
 
 def test_the_clock_of_velocities_is_described(

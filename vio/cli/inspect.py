@@ -71,6 +71,7 @@ def execute(args: argparse.Namespace) -> int:
             lambda d: guarded(
                 build_frontend(config.frontend.name, d.recording.camera, config.frontend, d),
                 d.recording.camera,
+                checks=config.frontend.checks,
             ),
             pairs=args.pairs,
             tracked=args.frames,

@@ -87,6 +87,7 @@ def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDa
             "speeds are unknown",
             f"not used: the points X Y Z of {file.name}",
         ),
+        repeats_settled=settings is not None and settings.repeated_tracks == "literal",
     )
     return FeatureDataset(recording, tracks, (), np.arange(len(numbers)))
 

@@ -161,9 +161,11 @@ class GuardedFrontend:
         return no_features(images.frame)
 
 
-def guarded(frontend: Frontend, camera: StereoCamera) -> GuardedFrontend:
-    """Return a front end between the checks; itself where it is already."""
-    if isinstance(frontend, GuardedFrontend):
+def guarded(frontend: Frontend, camera: StereoCamera, *, checks: bool = True) -> Frontend:
+    """Return a front end between the checks; itself where it is already, or where none are wanted
+    (`frontend.checks`).
+    """
+    if isinstance(frontend, GuardedFrontend) or not checks:
         return frontend
     return GuardedFrontend(frontend, camera)
 

@@ -292,7 +292,7 @@ def build_processor(
         source.T_cam0_body,
         source.motion,
         RunParts(
-            frontend=guarded(frontend, seen) if config.frontend.checks else frontend,
+            frontend=guarded(frontend, seen, checks=config.frontend.checks),
             selector=parts.selector
             or build_selector(config.selector, whole_record=_record(features), camera=seen),
             backend=backend,

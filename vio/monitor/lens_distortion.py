@@ -19,7 +19,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import cauchy_equations, jackknife, median
-from vio.records import Observations
+from vio.records import IntArray, Observations
 
 
 class _LensRules(NamedTuple):
@@ -28,14 +28,18 @@ class _LensRules(NamedTuple):
     # frames with matches, after which it is asked
     looked_at: tuple[int, ...] = (20, 40, 80, 160)
     most: int = 20  # whose matches are kept, spread over all so far
-    blocks: Tolerance[int] = 5  # of matches in a row, each of which is left out once
-    min_matches: int = 400
+    # of features, each of which is left out once: all matches of a feature have its error, which none
+    # of them shows
+    blocks: Tolerance[int] = 10
+    min_features: int = 100
     sigmas: float = 6.0  # beyond which it is known
+    # … where these are small: of a scene that hardly shows it, what is no noise comes to more
+    max_sigma: float = 0.01
     # Share of its distance from the principal point by which a pixel moves where that squared is half
     # the corners'. Healthy recordings have up to .014, of KITTI's own rectification.
     min_share: float = 0.03
     steps: Tolerance[int] = 10  # of the robust fit, and of each that leaves a block out
-    further_steps: Tolerance[int] = 5
+    further_steps: Tolerance[int] = 3
     least_px: float = 0.1  # width of a row's error, at least
 
 
@@ -56,7 +60,7 @@ class LensCheck:
     def __init__(self, camera: StereoCamera) -> None:
         """Begin, with the rectified pair."""
         self._camera = camera
-        self._matches: list[FloatArray] = []  # of every so many-th frame
+        self._matches: list[Observations] = []  # of every so many-th frame
         self._every = 1
         self._frames = 0
         width = camera.width or 2.0 * camera.cu
@@ -71,11 +75,10 @@ class LensCheck:
 
     def frame(self, seen: Observations) -> Finding | None:
         """Return the finding after a frame."""
-        matches = seen.z[seen.has_right]
-        if self.done or not len(matches):
+        if self.done or not seen.has_right.any():
             return None
         if self._frames % self._every == 0:
-            self._matches.append(matches)
+            self._matches.append(seen.take(seen.has_right))
         self._frames += 1
         if len(self._matches) > _LENS.most:
             del self._matches[1::2]
@@ -86,7 +89,7 @@ class LensCheck:
         if found is None:
             return None
         share, sigma = found
-        if abs(share) <= max(_LENS.min_share, _LENS.sigmas * sigma):
+        if abs(share) <= max(_LENS.min_share, _LENS.sigmas * sigma) or sigma > _LENS.max_sigma:
             return None
         self._frames = _LENS.looked_at[-1]
         index = seen.frame_index
@@ -101,18 +104,19 @@ class LensCheck:
 
     def _share(self) -> tuple[float, float] | None:
         """By which share of its distance from the principal point a pixel is off where that squared
-        is half the corners', and the standard error; None: too few matches.
+        is half the corners', and the standard error; None: too few features.
         """
-        if sum(map(len, self._matches)) < _LENS.min_matches:
+        ids = np.concatenate([seen.ids for seen in self._matches])
+        block = _blocks(ids, _LENS.blocks)
+        if len(np.unique(ids)) < _LENS.min_features:
             return None
-        z = np.concatenate(self._matches)
+        z = np.concatenate([seen.z for seen in self._matches])
         terms = self._terms(z)
         rows = (z[:, 3] - z[:, 1]) / self._camera.fv
         least = _LENS.least_px / self._camera.fv
         start = np.zeros(terms.shape[1])
         start[2] = median(rows)
         whole = _robust_fit(terms, rows, least, start, _LENS.steps)
-        block = np.arange(len(z)) * _LENS.blocks // len(z)
         without = [
             _robust_fit(terms[block != k], rows[block != k], least, whole, _LENS.further_steps)
             for k in range(_LENS.blocks)
@@ -128,6 +132,16 @@ class LensCheck:
         x = (z[:, 0] - self._camera.cu) / self._camera.fu
         y = (z[:, 1] - self._camera.cv) / self._camera.fv
         return np.column_stack([common[:, :2], rows, x * x * y, y**3, common[:, 2:]])
+
+
+def _blocks(ids: IntArray, count: int) -> IntArray:
+    """The block (N,) of matches by the ids of their features: those that were found together are in
+    one, and all of a feature.
+    """
+    _, feature, matches = np.unique(ids, return_inverse=True, return_counts=True)
+    before = np.cumsum(matches) - matches
+    out: IntArray = (before * count // len(ids))[feature]
+    return out
 
 
 def _robust_fit(
