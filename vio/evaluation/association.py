@@ -40,7 +40,8 @@ def associate(
     >= 1.
 
     By time where both have times, else by frame number: row k of a trajectory without frame numbers
-    is frame k. Times that were assumed, as of a recording that has none, count as none.
+    is frame k. Times that were assumed, as of a recording that has none, count as none, unless
+    they are the reference's.
 
     Raises:
         EvaluationError: no poses match.
@@ -50,7 +51,11 @@ def associate(
             f"cannot compare {len(estimate)} estimated poses with {len(reference)} reference poses"
         )
     # an assumed time is the number of its frame in other units
-    by_number = _has_assumed_times(estimate) and reference.frame_indices is not None
+    by_number = (
+        reference.frame_indices is not None
+        and _has_assumed_times(estimate)
+        and not _are_times_of(reference, estimate)
+    )
     if estimate.times_ns is not None and reference.times_ns is not None and not by_number:
         rows, reference_rows = _by_time(
             estimate.times_ns, reference.times_ns, max_time_difference_s
@@ -85,6 +90,18 @@ def _has_assumed_times(estimate: Trajectory) -> bool:
     if frames is None or estimate.times_ns is None:
         return False
     return np.array_equal(estimate.times_ns, ASSUMED_STEP_NS * frames)
+
+
+def _are_times_of(reference: Trajectory, estimate: Trajectory) -> bool:
+    """Return whether most times of an estimate, where it overlaps a reference, are the reference's:
+    then they are of a clock that ticks as assumed ones do, and numbers may count other frames.
+    """
+    own = estimate.times_ns
+    other = reference.times_ns
+    if own is None or other is None:
+        return False
+    own = own[(own >= other[0]) & (own <= other[-1])]
+    return len(own) > 1 and bool(np.isin(own, other).mean() > _COMMON)
 
 
 def _by_time(
