@@ -20,6 +20,7 @@ AssociationMode: TypeAlias = Literal["time", "frame"]
 _LONG_STEP_S = 2.0  # between poses of no reference, from which on their unit may be another one
 _SMALLER_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 _COMMON = 0.5  # of the span of an estimate, that the reference covers
+_SAME_CLOCK = 0.5  # of the times of either, that the other has to the nanosecond
 _LONGEST_S = 1e9  # fits integer nanoseconds
 
 
@@ -100,8 +101,11 @@ def _are_times_of(reference: Trajectory, estimate: Trajectory) -> bool:
     other = reference.times_ns
     if own is None or other is None:
         return False
-    own = own[(own >= other[0]) & (own <= other[-1])]
-    return len(own) > 1 and bool(np.isin(own, other).mean() > _COMMON)
+    first = max(own[0], other[0])
+    last = min(own[-1], other[-1])
+    fewest = min(((t >= first) & (t <= last)).sum() for t in (own, other))
+    common = np.intersect1d(own, other, assume_unique=True)
+    return bool(fewest > 1 and len(common) > _SAME_CLOCK * fewest)
 
 
 def _by_time(
