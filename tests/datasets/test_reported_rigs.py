@@ -8,10 +8,12 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import scipy.io
 import yaml
 from scipy.io import savemat
 
@@ -24,6 +26,7 @@ from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.rigs.source import stereo_pose_on_imu
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
+from vio.geometry.distortion import DistortionModel
 
 
 def _doubts(rig: Rig) -> list[str]:
@@ -581,3 +584,62 @@ def test_files_beside_a_calibration_are_called_what_they_are(
     (tmp_path / name).write_text(text)
     with pytest.raises(CalibrationError, match=message):
         vio.load_rig(tmp_path / name, image_size=SIZE)
+
+
+def _in_blocks(model: DistortionModel, **pose: object) -> dict[str, object]:
+    rig = forms.true_rig(model)
+    entries: dict[str, object] = dict(pose)
+    for side, c in zip(("left", "right"), rig.cameras, strict=True):
+        entries[side] = {"camera_matrix": c.K.tolist(), "dist_coeffs": list(c.coefficients)}
+    return entries
+
+
+_POSE = {"R": T_CAM1_CAM0[:3, :3].tolist(), "T": T_CAM1_CAM0[:3, 3].tolist()}
+
+
+@pytest.mark.parametrize("sides", [("left", "right"), ("left",)])
+@pytest.mark.parametrize("pose", [_POSE, {"stereo": _POSE}], ids=["beside", "in a block"])
+def test_blocks_of_sides_state_size_and_lens(
+    sides: tuple[str, ...], pose: dict[str, object], tmp_path: Path
+) -> None:
+    entries = _in_blocks("equidistant", **pose)
+    for side in sides:
+        block = entries[side]
+        assert isinstance(block, dict)
+        block |= {"distortion_model": "equidistant", "width": SIZE[0], "height": SIZE[1]}
+    (tmp_path / "stereo.yaml").write_text(yaml.safe_dump(entries))
+    rig = vio.load_rig(tmp_path / "stereo.yaml")
+    assert rig.cam0.model == "equidistant"
+    assert (rig.cam0.width, rig.cam0.height) == SIZE
+    np.testing.assert_allclose(rig.right[1], T_CAM1_CAM0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["sub/kalibr_imucam_chain.yaml", "''", "1"])
+def test_settings_of_openvins_name_a_file_of_another_folder(name: str, tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    forms.openvins(tmp_path / "sub")
+    settings = tmp_path / "estimator_config.yaml"
+    settings.write_text(f"%YAML:1.0\nrelative_config_imucam: {name}\n")
+    if name.startswith("sub"):
+        assert vio.load_rig(settings).cam0.width == SIZE[0]
+    else:
+        with pytest.raises(CalibrationError, match="relative_config_imucam names no file"):
+            vio.load_rig(settings)
+
+
+def test_arrays_of_a_recording_beside_a_calibration_are_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    savemat(tmp_path / "data.mat", {"points": np.zeros((3, 5000)), "rate": 10.0})
+    forms.matlab(tmp_path)
+    read: list[list[str]] = []
+    whole = scipy.io.loadmat
+
+    def loadmat(path: Path, **options: Any) -> Any:
+        read.append(options["variable_names"])
+        return whole(path, **options)
+
+    monkeypatch.setattr(scipy.io, "loadmat", loadmat)
+    assert vio.load_rig(tmp_path).cam0.width == SIZE[0]
+    assert ["rate"] in read
+    assert not any("points" in names for names in read)

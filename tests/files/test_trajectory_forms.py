@@ -4,6 +4,7 @@ is tried against the other trajectory.
 
 from __future__ import annotations
 
+import datetime as dt
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -679,7 +680,7 @@ def test_positions_of_photogrammetry_have_the_times_of_their_images(
     np.testing.assert_array_equal(read.times_ns, TIMES_NS)
     np.testing.assert_array_equal(read.positions, P)
     assert read.orientations == "none"
-    for name in ("IMG_{:04d}.JPG", "{:06d}.png"):
+    for name in ("IMG_{:04d}.JPG", "{:06d}.png", "20240512_14{:04d}.jpg", "2024051214{:04d}.jpg"):
         names = [name.format(k) for k in range(COUNT)]
         file = _write(tmp_path / "cameras.txt", header, names, columns, separator)
         with pytest.raises(DataError, match=r"names of images .* which are no times"):
@@ -701,3 +702,76 @@ def test_numbers_of_frames_are_no_times(name: str, tmp_path: Path) -> None:
         read_trajectory(_write(tmp_path / "blender.csv", header, numbers, XYZW, ","))
     read = read_trajectory(_write(tmp_path / "blender.csv", header, SECONDS, XYZW, ","))
     np.testing.assert_array_equal(read.times_ns, TIMES_NS)
+
+
+@pytest.mark.parametrize("name", ["cam0/data/{ns}.png", "{s:.9f}.png", "{day}_%H-%M-%S-%f.png"])
+def test_images_are_named_by_times_in_several_ways(name: str, tmp_path: Path) -> None:
+    start_ns = 1_700_000_000_000_000_000
+    times_ns = start_ns + 50_000_000 * np.arange(COUNT)
+    names = []
+    for time_ns in times_ns.tolist():
+        date = dt.datetime.fromtimestamp(0, dt.timezone.utc) + dt.timedelta(
+            microseconds=time_ns // 1000
+        )
+        text = name.format(ns=time_ns, s=(time_ns - start_ns) * 1e-9, day="%Y-%m-%d")
+        names.append(date.strftime(text))
+    if ".9f" in name:
+        times_ns = times_ns - start_ns
+    read = read_trajectory(_write(tmp_path / "a.txt", "#name,x,y,z", names, [P], ","))
+    np.testing.assert_array_equal(read.times_ns, times_ns)
+
+
+@pytest.mark.parametrize("name", ["frame", "image"])
+def test_times_under_the_name_of_a_frame_are_times(name: str, tmp_path: Path) -> None:
+    read = read_trajectory(_write(tmp_path / "a.csv", f"{name},x,y,z,qx,qy,qz,qw", NS, XYZW, ","))
+    np.testing.assert_array_equal(read.times_ns, TIMES_NS)
+    # a comment that names no columns
+    seconds = [str(1_700_000_000 + k) for k in range(COUNT)]
+    read = read_trajectory(_write(tmp_path / "a.txt", "# frame map", seconds, XYZW, " "))
+    assert read.times_ns is not None
+    assert set(np.diff(read.times_ns)) == {10**9}
+
+
+def test_a_header_without_times_is_refused(tmp_path: Path) -> None:
+    x = [str(3.0 + 2 * k) for k in range(COUNT)]
+    file = _write(tmp_path / "a.csv", "x,y,z,qx,qy,qz,qw", x, [P[:, 1:], *XYZW[1:]], ",")
+    with pytest.raises(DataError, match="names no column of times"):
+        read_trajectory(file)
+
+
+@pytest.mark.parametrize("separator", [";", "\t", " "])
+def test_dates_keep_what_is_behind_a_decimal_comma(separator: str, tmp_path: Path) -> None:
+    dates = [f"2024-05-12 14:03:{k // 4:02d},{k % 4 * 250:03d}" for k in range(COUNT)]
+    file = _write(tmp_path / "a.csv", "", dates, XYZW, separator)
+    for points in (True, False):
+        if not points:
+            file.write_text(file.read_text().replace(".", ","))
+        times_ns = read_trajectory(file).times_ns
+        assert times_ns is not None
+        assert set(np.diff(times_ns)) == {250_000_000}
+
+
+def test_dates_between_quotes_are_read(tmp_path: Path) -> None:
+    dates = [f'"2024-05-12 14:03:{k:02d}.25"' for k in range(COUNT)]
+    read = read_trajectory(_write(tmp_path / "a.csv", "", dates, WXYZ, ","))
+    assert read.times_ns is not None
+    assert read.times_ns[0] % 10**9 == 250_000_000
+    file = _write(tmp_path / "a.csv", "", [date[:-1] for date in dates], WXYZ, ",")
+    with pytest.raises(DataError, match="is no time"):
+        read_trajectory(file)
+
+
+def test_x_that_points_north_is_no_east(tmp_path: Path) -> None:
+    names = [f"{t}.png" for t in NS]
+    header = "#Label,X/Northing,Y/Easting,Z/Altitude,Yaw,Pitch,Roll"
+    read = read_trajectory(_write(tmp_path / "a.csv", header, names, [P, ANGLES], ","))
+    np.testing.assert_array_equal(read.positions, P[:, [1, 0, 2]])
+
+
+@pytest.mark.parametrize("numbers", [37, 42, 6])
+def test_messages_of_other_types_are_no_poses(numbers: int, tmp_path: Path) -> None:
+    values = np.zeros((COUNT, numbers))
+    values[:, 3] = 1.0  # as the w of an orientation, or of a rate, behind three zeros
+    stamps = [f"17000000{k:02d},{500_000_000},imu" for k in range(COUNT)]
+    with pytest.raises(DataError, match=f"whose {numbers} numbers are those of no pose"):
+        read_trajectory(_write(tmp_path / "a.csv", "", stamps, [values], ","))

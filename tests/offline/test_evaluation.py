@@ -206,6 +206,19 @@ def test_assumed_times_are_those_of_no_clock(step_ns: int, mode: str, count: int
     assert associate(estimate, alone)[0] == "time"
 
 
+@pytest.mark.parametrize("every", [1, 2])
+def test_times_that_both_have_are_no_assumed_ones(every: int) -> None:
+    frames = np.arange(40)
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    estimate = Trajectory(poses, 100_000_000 * frames, "cam0", frames)
+    # a part of the same simulation, whose own numbers begin at 0
+    part = frames[10:30:every]
+    reference = Trajectory(poses[part], 100_000_000 * part, "cam0", np.arange(len(part)))
+    mode, rows, _ = associate(estimate, reference)
+    assert mode == "time"
+    np.testing.assert_array_equal(rows, part)
+
+
 # The KITTI metric
 
 

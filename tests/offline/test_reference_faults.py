@@ -14,6 +14,7 @@ import pytest
 from vio.errors import DataError, EvaluationError
 from vio.evaluation import reference_faults
 from vio.evaluation.alignment import Alignment
+from vio.evaluation.association import take
 from vio.evaluation.trajectories import evaluate
 from vio.files.epochs import epoch_hint
 from vio.files.trajectories import read_trajectory
@@ -361,3 +362,42 @@ def test_other_errors_are_no_jumps(seed: int) -> None:
     jumped = replace(estimate, T_world_body=_jumping(200, 300, 0.5).T_world_body)
     for case in (estimate, jumped):
         assert not [note for note in evaluate(case, truth).notes if "jumps" in note]
+
+
+def _lost(first: int, last: int) -> Trajectory:
+    """The estimate of a body that goes on while it is taken to stand, from one pose to another."""
+    estimate = _odometry(1.01, 0.0, 0.005)
+    poses = estimate.T_world_body.copy()
+    away = poses[last - 1, :3, 3] - poses[first, :3, 3]
+    poses[first:last, :3, 3] = poses[first, :3, 3]
+    poses[last:, :3, 3] -= away
+    return replace(estimate, T_world_body=poses)
+
+
+@pytest.mark.parametrize(("first", "last"), [(COUNT - 20, COUNT), (150, 170)])
+def test_an_estimate_that_loses_the_body_is_no_jump_of_the_reference(first: int, last: int) -> None:
+    notes = evaluate(_lost(first, last), _trajectory()).notes
+    assert not [note for note in notes if "jumps" in note]
+
+
+def test_a_step_over_a_gap_that_an_estimate_loses_is_no_jump_of_the_reference() -> None:
+    kept = np.r_[0:150, 170:COUNT]
+    lost = take(_lost(150, 170), kept)
+    assert not [n for n in evaluate(lost, take(_trajectory(), kept)).notes if "jumps" in n]
+
+
+def test_a_short_drive_after_a_long_rest_is_no_jump() -> None:
+    moved = np.diff(_trajectory().positions[:20], axis=0, prepend=_trajectory().positions[:1])
+    steps = np.zeros((COUNT, 3))
+    steps[10:30] = moved
+    truth = _trajectory()
+    poses = truth.T_world_body.copy()
+    poses[:, :3, 3] = np.cumsum(steps, axis=0)
+    reference = replace(truth, T_world_body=poses)
+    poses = poses.copy()
+    shares = np.linspace(0.7, 1.3, 20)[:, None]
+    steps[10:30] *= shares
+    poses[:, :3, 3] = np.cumsum(steps, axis=0)
+    poses[:, :3, 3] += 1e-4 * np.random.default_rng(0).standard_normal((COUNT, 3))
+    estimate = replace(truth, T_world_body=poses)
+    assert not [note for note in evaluate(estimate, reference).notes if "jumps" in note]

@@ -20,6 +20,7 @@ AssociationMode: TypeAlias = Literal["time", "frame"]
 _LONG_STEP_S = 2.0  # between poses of no reference, from which on their unit may be another one
 _SMALLER_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 _COMMON = 0.5  # of the span of an estimate, that the reference covers
+_SAME_CLOCK = 0.5  # of the times of either, that the other has to the nanosecond
 _LONGEST_S = 1e9  # fits integer nanoseconds
 
 
@@ -40,7 +41,8 @@ def associate(
     >= 1.
 
     By time where both have times, else by frame number: row k of a trajectory without frame numbers
-    is frame k. Times that were assumed, as of a recording that has none, count as none.
+    is frame k. Times that were assumed, as of a recording that has none, count as none, unless
+    they are the reference's.
 
     Raises:
         EvaluationError: no poses match.
@@ -50,7 +52,11 @@ def associate(
             f"cannot compare {len(estimate)} estimated poses with {len(reference)} reference poses"
         )
     # an assumed time is the number of its frame in other units
-    by_number = _has_assumed_times(estimate) and reference.frame_indices is not None
+    by_number = (
+        reference.frame_indices is not None
+        and _has_assumed_times(estimate)
+        and not _are_times_of(reference, estimate)
+    )
     if estimate.times_ns is not None and reference.times_ns is not None and not by_number:
         rows, reference_rows = _by_time(
             estimate.times_ns, reference.times_ns, max_time_difference_s
@@ -85,6 +91,21 @@ def _has_assumed_times(estimate: Trajectory) -> bool:
     if frames is None or estimate.times_ns is None:
         return False
     return np.array_equal(estimate.times_ns, ASSUMED_STEP_NS * frames)
+
+
+def _are_times_of(reference: Trajectory, estimate: Trajectory) -> bool:
+    """Return whether most times of an estimate, where it overlaps a reference, are the reference's:
+    then they are of a clock that ticks as assumed ones do, and numbers may count other frames.
+    """
+    own = estimate.times_ns
+    other = reference.times_ns
+    if own is None or other is None:
+        return False
+    first = max(own[0], other[0])
+    last = min(own[-1], other[-1])
+    fewest = min(((t >= first) & (t <= last)).sum() for t in (own, other))
+    common = np.intersect1d(own, other, assume_unique=True)
+    return bool(fewest > 1 and len(common) > _SAME_CLOCK * fewest)
 
 
 def _by_time(

@@ -33,6 +33,7 @@ class _FaultRules(NamedTuple):
     min_jump_m: float = 0.01  # to the identity: below, a body may stand at its start
     begun: float = 5.0  # of the largest further step, that a body does not jump by at its start
     smooth: float = 0.9  # quantile of the steps' differences: jumps are fewer than the rest
+    sudden: float = 0.5  # share of a jump by which the reference's own speed must change
     max_arm_m: float = 5.0  # of a reference's point from the body that is estimated
     fits: Tolerance[int] = 10  # of a lever arm beside an alignment
 
@@ -42,7 +43,11 @@ _ROUNDING: Tolerance[float] = 1e-9  # of a reference's extent: errors below it a
 
 
 def position_fault(
-    estimate: Trajectory, reference: Trajectory, T_est: FloatArray, T_ref: FloatArray
+    estimate: Trajectory,
+    reference: Trajectory,
+    T_est: FloatArray,
+    T_ref: FloatArray,
+    clock: IntArray,
 ) -> str | None:
     """Return what explains the distances between positions after an alignment with scale; None:
     nothing does, or they are small.
@@ -57,6 +62,7 @@ def position_fault(
         reference: likewise.
         T_est: (M, 4, 4) poses that were paired.
         T_ref: (M, 4, 4) the poses of the reference.
+        clock: (M,) times or numbers of these pairs, increasing.
     """
     lost = _placeholders(estimate, "estimate") or _placeholders(reference, "reference")
     if lost is not None:
@@ -93,7 +99,7 @@ def position_fault(
             )
     return (
         _held_fault(x, y, error_m)
-        or _jump_fault(x, y, error_m)
+        or _jump_fault(x, y, clock, error_m)
         or _clock_fault(estimate, reference, _FAULT.explained)
     )
 
@@ -117,24 +123,32 @@ def _held_fault(x: FloatArray, y: FloatArray, error_m: float) -> str | None:
     )
 
 
-def _jump_fault(x: FloatArray, y: FloatArray, error_m: float) -> str | None:
+def _jump_fault(x: FloatArray, y: FloatArray, clock: IntArray, error_m: float) -> str | None:
     """Return the note on single steps of a reference that the estimate does not make, as where a
     receiver or a camera system takes another solution; None: there are none, or they explain
     nothing of the error.
 
+    A step that the reference's own speed explains is none: there the estimate lost the body.
+
     Args:
         x: (M, 3) positions of the estimate.
         y: (M, 3) of the reference.
+        clock: (M,) their times or numbers, increasing.
         error_m: between them, after a similarity.
     """
     own = np.diff(x, axis=0)
     other = np.diff(y, axis=0)
     own_m = np.linalg.norm(own, axis=1)
     other_m = np.linalg.norm(other, axis=1)
-    scale = float(np.median(other_m) / max(np.median(own_m), _ROUNDING))
+    moving = own_m >= own_m.mean()  # others may be noise of a body at rest
+    scale = float(np.median(other_m[moving]) / max(np.median(own_m[moving]), _ROUNDING))
     further_m = other_m - scale * own_m
-    least_m = max(_FAULT.begun * float(np.quantile(np.abs(further_m), _FAULT.smooth)), _ROUNDING)
-    jumps = further_m > max(least_m, _FAULT.min_jump_m)
+    sudden_m = _sudden_m(other, np.diff(clock))
+    jumps = (
+        (further_m > _least_jump_m(further_m))
+        & (sudden_m > _least_jump_m(sudden_m))
+        & (sudden_m > _FAULT.sudden * further_m)
+    )
     if not jumps.any():
         return None
     U, _, Vt = np.linalg.svd(other[~jumps].T @ own[~jumps])
@@ -147,10 +161,28 @@ def _jump_fault(x: FloatArray, y: FloatArray, error_m: float) -> str | None:
     count = int(jumps.sum())
     return (
         f"the reference jumps {count} time{'s' * (count > 1)} by up to "
-        f"{further_m.max():.3g} m, first at pose {first} of {len(y)} that were compared, where the "
+        f"{further_m[jumps].max():.3g} m, first at pose {first} of {len(y)} that were compared, where the "
         f"estimate does not (ATE after Sim(3) {left_m:.3g} m without the jumps, {error_m:.3g} m with): "
         "leave out what lies between them, or the part that is off"
     )
+
+
+def _sudden_m(steps: FloatArray, spans: IntArray) -> FloatArray:
+    """Return by how much each of N steps (N, 3), of spans (N,) of a clock, differs from what the
+    speeds of the steps before and after it make of its span.
+    """
+    speeds = steps / np.maximum(spans, 1)[:, None]
+    before = np.concatenate([speeds[1:2], speeds[:-1]])
+    after = np.concatenate([speeds[1:], speeds[-2:-1]])
+    usual = 0.5 * (before + after) * np.maximum(spans, 1)[:, None]
+    out: FloatArray = np.linalg.norm(steps - usual, axis=1)
+    return out
+
+
+def _least_jump_m(lengths_m: FloatArray) -> float:
+    """Return the length beyond which those of single steps (N,) are no scatter of all."""
+    usual_m = float(np.quantile(np.abs(lengths_m), _FAULT.smooth))
+    return max(_FAULT.begun * usual_m, _FAULT.min_jump_m)
 
 
 def lever_arm_note(T_est: FloatArray, T_ref: FloatArray) -> str | None:

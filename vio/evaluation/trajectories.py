@@ -226,7 +226,7 @@ def evaluate(
     aligned = replace(moved, T_world_body=apply_alignment(alignment, moved.T_world_body))
     T_aligned = aligned.T_world_body[rows]
     errors_deg = rotation_angle_deg(se3_inverse(T_ref) @ T_aligned)
-    fault = position_fault(moved, reference, T_est, T_ref)
+    fault = position_fault(moved, reference, T_est, T_ref, _clock_of(reference, reference_rows))
     scale_free = _scale_free(T_est, T_ref)
     return Evaluation(
         align=align,
@@ -276,6 +276,14 @@ def evaluate(
             ),
         ),
     )
+
+
+def _clock_of(reference: Trajectory, rows: IntArray) -> IntArray:
+    """Return the times of rows (M,), or the numbers of their frames where there are none."""
+    chosen = take(reference, rows)
+    clock = chosen.frame_indices if chosen.times_ns is None else chosen.times_ns
+    assert clock is not None  # rows are numbered
+    return clock
 
 
 def _scale_free(T_est: FloatArray, T_ref: FloatArray) -> ScaleFree | None:

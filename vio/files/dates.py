@@ -22,7 +22,9 @@ _NAMED = re.compile(
 )
 # whose nanoseconds fit 64 bits
 _WRITTEN = re.compile(
-    r"(?P<day>(?:19|20|21)\d\d-\d\d-\d\d)[ T](?P<clock>\d\d:\d\d:\d\d(?:\.\d{0,9})?)"
+    r"(?P<day>(?:19|20|21)\d\d-\d\d-\d\d)[ T](?P<clock>\d\d:\d\d:\d\d(?:\.\d{0,9}|"
+    # a decimal comma, where no commas are between the cells
+    r",\d{1,9}(?=[;\t]|\s+[^,\s]|[Z+-]|$))?)"
     r"(?:Z|(?P<sign>[+-])(?P<hours>[01]\d):?(?P<minutes>[0-5]\d))?"
 )
 
@@ -36,7 +38,7 @@ def date_ns(text: str) -> int:
     found = _WRITTEN.fullmatch(text.strip())
     if found is None:
         raise ValueError(text)
-    written = f"{found['day']}T{found['clock'].rstrip('.')}"
+    written = f"{found['day']}T{found['clock'].rstrip('.').replace(',', '.')}"
     local_ns = int(np.datetime64(written, "ns").astype(np.int64))
     if found["sign"] is None:
         return local_ns
@@ -48,15 +50,22 @@ def undated(line: str) -> str:
     """Return a line of a table that begins with a date of ISO 8601 with its nanoseconds since 1970
     instead; others as they are.
     """
-    if line[4:5] != "-" or (found := _WRITTEN.match(line)) is None:
+    start = int(line[:1] == '"')
+    if line[start + 4 : start + 5] != "-" or (found := _WRITTEN.match(line, start)) is None:
         return line
-    rest = line[found.end() :]
-    if rest[:1] not in ",;\t ":
+    rest = line[found.end() + start :]
+    if line[: found.end() + start].count('"') != 2 * start or rest[:1] not in ",;\t ":
         return line
     try:
         return f"{date_ns(found[0])}{rest}"
     except ValueError:  # as of a 13th month, which its reader reports
         return line
+
+
+def are_whole_dates(stems: Sequence[str]) -> bool:
+    """Return whether names state dates to the second, as those of phones: 20240512_140322."""
+    found = [_NAMED.fullmatch(stem) for stem in stems]
+    return all(name is not None and name["part"] is None for name in found)
 
 
 def dates_in_names(stems: Sequence[str]) -> IntArray | None:

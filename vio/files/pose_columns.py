@@ -65,8 +65,8 @@ _ON_EARTH = (
     (_EAST, _NORTH, _HEIGHT),
     (_X, _Y, _HEIGHT),
 )
-# behind the letter of an axis, as of X/East
-_ALSO_ON_EARTH = re.compile(r"(?<=^[xyz])/(?:east|north|alt)[a-z]*$")
+# the letter of an axis before what it is, as of X/East; some call x what points north
+_ALSO_ON_EARTH = re.compile(r"^[xyz]/(?=(?:east|north|alt)[a-z]*$)")
 # a component by its number, as position[0] or q_3
 _NUMBERED = re.compile(r"([a-z][a-z_. ]*?)[\[(_. ]?([0-4])[\])]?")
 _POSITION_ALONE = re.compile(r"(?:p|t|pos|position|trans|translation|xyz)")

@@ -20,12 +20,12 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text
-from vio.files.dates import undated
+from vio.files.dates import are_whole_dates, dates_in_names, undated
 from vio.files.messages import joined_stamps
 from vio.files.pose_columns import PoseColumns, are_geographic, named_columns, pose_columns
 from vio.files.stamps import POSE_PACE, parse_stamps
 from vio.files.text import exact_text, lines_of, seconds_text, whole_ns_stamps
-from vio.files.units import split_cells, with_decimal_points
+from vio.files.units import header_cells, split_cells, with_decimal_points
 from vio.geometry.lie import (
     FloatArray,
     nearest_rotation,
@@ -193,7 +193,14 @@ def _named(table: _Table) -> PoseColumns | None:
             f"{table.path}: its header names latitude and longitude, which are no metres; give "
             "positions in metres, as a local frame of east, north and up has them"
         )
-    return None if named is None or _are_of_matrices(table, named) else named
+    if named is None or _are_of_matrices(table, named):
+        return None
+    if not named.names_stamp and named.stamp in (*named.position, *(named.quaternion or ())):
+        raise DataError(
+            f"{table.path}: its header names no column of times, and begins with those of the pose; write "
+            "the time of each pose in front"
+        )
+    return named
 
 
 def _are_of_matrices(table: _Table, named: PoseColumns) -> bool:
@@ -331,11 +338,11 @@ def _check_numbers(table: _Table, columns: PoseColumns, stamps: Sequence[str]) -
     """Raise DataError where a header calls the numbers of frames so that are taken for times."""
     if columns.names_stamp or not table.comments:
         return
-    names = split_cells(table.comments[-1])
-    is_number = len(names) > columns.stamp and _NUMBER_OF_A_FRAME.fullmatch(
-        names[columns.stamp].strip().lower()
-    )
-    if is_number and all(_WHOLE.fullmatch(stamp) for stamp in stamps):
+    names = header_cells(table.comments[-1], len(table.fields(0)))
+    is_number = bool(names) and _NUMBER_OF_A_FRAME.fullmatch(names[columns.stamp].strip().lower())
+    if is_number and all(
+        _WHOLE.fullmatch(stamp) and abs(int(stamp)) < _POSES.max_frame_number for stamp in stamps
+    ):
         raise DataError(
             f"{table.path}: its column {names[columns.stamp]!r} numbers frames, and none has their times; "
             "write the time of each frame in its place"
@@ -496,7 +503,7 @@ def _read_table(path: Path) -> _Table:
         elif line:
             rows.append(undated(line.rstrip(",;").rstrip()))
             line_numbers.append(number)
-    rows, named = joined_stamps(_without_suffixes(rows, path), stated=bool(comments))
+    rows, named = joined_stamps(_without_suffixes(rows, path), path, stated=bool(comments))
     comments += named
     first = rows[0] if rows else ""
     cells = split_cells(first)
@@ -512,24 +519,37 @@ def _read_table(path: Path) -> _Table:
 
 
 def _without_suffixes(rows: Sequence[str], path: Path) -> list[str]:
-    """Return rows that begin with the names of images, as of photogrammetry, without the suffixes.
+    """Return rows that begin with the names of images, as of photogrammetry, with their times
+    instead: whole numbers beyond those of frames, decimals, or dates with fractions of a second.
 
     Raises:
         DataError: the names are no times.
     """
+    if not rows or _IMAGE.match(rows[0]) is None:
+        return list(rows)
     names = [_IMAGE.match(row) for row in rows]
     found = [name for name in names if name is not None]
-    if not found or len(found) < len(rows):
+    if len(found) < len(rows):
         return list(rows)
-    stems = [name[1] for name in found]
-    if any(not _is_number(stem) or float(stem) < _POSES.max_frame_number for stem in stems):
+    stems = [re.split(r"[/\\]", name[1])[-1] for name in found]
+    dates = dates_in_names(stems)
+    if dates is not None:
+        stems = [str(time) for time in dates.tolist()]
+    elif are_whole_dates(stems) or not all(map(_is_time, stems)):
         raise DataError(
-            f"{path}: begins its rows with names of images ({found[0][0]}), which are no times; write the "
-            "time of each image in its place"
+            f"{path}: begins its rows with names of images ({found[0][0]}), which are no times (numbers, or "
+            "dates with fractions of a second); write the time of each image in its place"
         )
     return [
         f"{stem}{row[name.end() :]}" for stem, name, row in zip(stems, found, rows, strict=True)
     ]
+
+
+def _is_time(stem: str) -> bool:
+    """Return whether the name of an image is a time: decimals, or beyond the numbers of frames."""
+    return re.fullmatch(r"\d+\.\d+", stem) is not None or (
+        stem.isdecimal() and int(stem) >= _POSES.max_frame_number
+    )
 
 
 def _check_poses(path: Path, comments: Sequence[str], first: str) -> None:

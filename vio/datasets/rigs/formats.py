@@ -289,8 +289,13 @@ def _is_sensor_sheet(entries: Entries) -> bool:
 
 
 def _openvins(source: Source) -> Rig:
-    """Read the camchain that OpenVINS's settings name, beside them."""
-    camchain = source.path.with_name(str(source.entries[_NAMED]))
+    """Read the camchain that OpenVINS's settings name, from their folder on."""
+    named = source.entries[_NAMED]
+    if not isinstance(named, str) or not named.strip():
+        raise CalibrationError(
+            f"{source.where}: {_NAMED} names no file; write that of the cameras there"
+        )
+    camchain = source.path.parent / named.strip()
     return read_camchain(camchain, alone=source.cameras == 1)
 
 

@@ -10,6 +10,7 @@ Calibration Toolbox for Matlab.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ _OF_BOUGUET = (
     *("R", "T", "nx", "ny"),
 )
 _MAX_BYTES = 50_000_000  # with the points of all views
+_LARGEST = 100  # elements of a variable of a calibration, of which a structure is one
 _SHORT_M = 0.005  # no stereo camera has a shorter baseline
 
 
@@ -48,7 +50,9 @@ def read_mat(path: Path) -> dict[str, object]:
         return {}
     shapes, _ = read_variables(path, lambda _: False)
     of_bouguet = "fc_left" in shapes and "fc_right" in shapes
-    wanted = _OF_BOUGUET if of_bouguet else [name for name in shapes if name not in _OF_BOUGUET]
+    others = [name for name in shapes if name not in _OF_BOUGUET]
+    # structures, whatever they hold, and no arrays of a recording
+    wanted = _OF_BOUGUET if of_bouguet else [n for n in others if math.prod(shapes[n]) <= _LARGEST]
     _, found = read_variables(path, wanted.__contains__, plain=True)
     entries = {name: _plain(value) for name, value in found.items()}
     return {name: value for name, value in entries.items() if value is not None}

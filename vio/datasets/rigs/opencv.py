@@ -21,6 +21,7 @@ import numpy as np
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import naming
 from vio.datasets.rigs.plausible import checked_rig, unit_doubt
+from vio.datasets.sides import side_word
 from vio.datasets.yaml_files import (
     MAX_BYTES,
     Entries,
@@ -78,6 +79,11 @@ _SIZES = (
     ("imageWidth", "imageHeight"),
     ("LEFT.width", "LEFT.height"),
 )
+_SIZE_NAMES = ("image_size", "imageSize", "imgSize", "size", "image_Size", "imageResolution")
+
+
+# what both cameras of a pair have alike
+_OF_A_PAIR = (*("distortion_model", "camera_model", "model"), *_SIZE_NAMES, *sum(_SIZES, ()))
 
 
 def is_opencv(entries: Entries) -> bool:
@@ -87,14 +93,29 @@ def is_opencv(entries: Entries) -> bool:
 
 
 def _without_blocks(entries: Entries) -> dict[str, object]:
-    """Return entries with those of blocks, as of `left:` and `right:`, by both names joined."""
+    """Return entries with those of blocks, as of `left:` and `right:`, by both names joined.
+
+    What the blocks of both sides state alike, as the lens model, and what a block of no side states,
+    as the pose, goes by its own name too.
+    """
     flat = dict[str, object]()
+    blocks = dict[str, dict[str, object]]()
     for name, value in entries.items():
         of_another_form = _NUMBERED.fullmatch(name) is not None
         if not isinstance(value, dict) or "data" in value or of_another_form:
             flat[name] = value
         else:
-            flat |= {f"{name}_{inner}": part for inner, part in value.items()}
+            blocks[name] = {str(inner): part for inner, part in value.items()}
+            flat |= {f"{name}_{inner}": part for inner, part in blocks[name].items()}
+    of_sides = [block for name, block in blocks.items() if side_word(name) is not None]
+    others = [block for name, block in blocks.items() if side_word(name) is None]
+    alike = dict[str, object]()
+    for name in _OF_A_PAIR:
+        stated = [block[name] for block in of_sides if name in block]
+        if stated and all(value == stated[0] for value in stated):
+            alike[name] = stated[0]
+    for block in (alike, *others):
+        flat = {**block, **flat}
     return flat
 
 
@@ -313,7 +334,7 @@ def _size(
         found = [as_number(entries.get(name)) for name in names]
         if all(value >= 1 for value in found):
             return int(found[0]), int(found[1]), True
-    for name in ("image_size", "imageSize", "imgSize", "size", "image_Size", "imageResolution"):
+    for name in _SIZE_NAMES:
         if name in entries:
             values = np.ravel(matrix(entries[name], None, f"{where}, {name}"))
             if len(values) == 2 and values.min() >= 1:
