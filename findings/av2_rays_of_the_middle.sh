@@ -3,7 +3,7 @@
 # `frustum_planes`. `project_cam_to_img` of the same camera uses them: a point, projected and turned back into a ray, is beside itself by the principal point's offset.
 # Guessed: "given (u,v) coordinates and intrinsics, generate pixel rays" uses the intrinsics, which the camera has; the two functions are inverse to one another.
 # Matters here: rays of a stereo pair whose cameras differ in cx have that difference as disparity: with 5 px between the two, as may be, points at 40 m come out at 34. Rows shift as
-# well, so headings and gravity of a camera pose from such rays are off by 0.3 degrees. Cameras with a centred principal point, as in the devkit's own tests, show nothing.
+# well, so headings and gravity of a camera pose from such rays are off by 0.3 degrees. Cameras with a centred principal point show nothing.
 # Source: https://github.com/argoverse/av2-api, tests/unit/geometry/camera/test_pinhole_camera.py (cx 1235.0, cy 1008.5 of `stereo_front_left`); this run.
 set -euo pipefail
 folder=$(mktemp -d)
