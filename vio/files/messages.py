@@ -1,4 +1,4 @@
-"""Rows of poses whose stamps stand in two columns that no header names: seconds and nanoseconds, as
+"""Rows of poses whose stamps are in two columns that no header names: seconds and nanoseconds, as
 of `ros2 topic echo --csv`, which writes the names of frames behind them.
 """
 

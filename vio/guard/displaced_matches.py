@@ -17,7 +17,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.match_check import Hysteresis, MatchCheck, SharedMatches, without_right
 from vio.numerics.compiled import solve_positive
-from vio.numerics.robust import median
+from vio.numerics.robust import cauchy_fit, median
 from vio.records import Observations
 
 
@@ -69,7 +69,8 @@ class DisplacedMatches(MatchCheck):
         terms = self._terms(z)
         rows = z[:, 3] - z[:, 1]
         if not self._frames:
-            self._field = _field_of(terms, rows)
+            self._field[0] = median(rows)
+            self._field = cauchy_fit(terms, rows, self._field, ROW_SIGMA_PX, _ROWS.first_steps)
         distance_px = np.abs(rows - terms @ self._field)
         off_px = median(distance_px)
         limit_px = max(_ROWS.min_rows_px, _ROWS.clear_ratio * self._usual_px)
@@ -126,29 +127,8 @@ class DisplacedMatches(MatchCheck):
         self._normal *= _ROWS.memory
         self._moment *= _ROWS.memory
         add_equations(terms, rows, self._field, ROW_SIGMA_PX, self._normal, self._moment)
-        self._field = _solution(self._normal, self._moment)
+        self._field = self._moment.copy()
+        solve_positive(self._normal + 1e-6 * np.eye(_TERMS), self._field)
         self._frames += 1
         gain = max(_ROWS.usual_gain, 1.0 / self._frames)
         self._usual_px += gain * (off_px - self._usual_px)
-
-
-def _field_of(terms: FloatArray, rows: FloatArray) -> FloatArray:
-    """The field (6,) that most rows (N,) of one frame agree with, whatever the others are; terms
-    (N, 6).
-    """
-    field = np.zeros(_TERMS)
-    field[0] = median(rows)
-    for _ in range(_ROWS.first_steps):
-        sigma_px = max(ROW_SIGMA_PX, median(np.abs(rows - terms @ field)))
-        normal = np.zeros((_TERMS, _TERMS))
-        moment = np.zeros(_TERMS)
-        add_equations(terms, rows, field, sigma_px, normal, moment)
-        field = _solution(normal, moment)
-    return field
-
-
-def _solution(normal: FloatArray, moment: FloatArray) -> FloatArray:
-    """The field (6,) of normal equations (6, 6), (6,)."""
-    field = moment.copy()
-    solve_positive(normal + 1e-6 * np.eye(_TERMS), field)
-    return field

@@ -89,11 +89,11 @@ def is_corrected(finding: Finding) -> bool:
     return rows_grade(finding.figures["rows_rms_px"]) == "worth calibrating"
 
 
-def _rows_are_off(field: StereoFieldEstimate | None) -> bool:
+def _rows_are_off(field: StereoFieldEstimate) -> bool:
     """Whether rows of left and right differ by more than is negligible, and than the noise of the
     matches that they are fitted to explains.
     """
-    if field is None or rows_grade(field.rows_rms_px) == "negligible":
+    if rows_grade(field.rows_rms_px) == "negligible":
         return False
     if field.rows is None or field.rows_covariance is None:
         return True

@@ -18,7 +18,7 @@ from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.kinds import Tolerance
-from vio.numerics.robust import cauchy_equations, jackknife, median
+from vio.numerics.robust import cauchy_fit, jackknife, median
 from vio.records import IntArray, Observations
 
 
@@ -44,7 +44,6 @@ class _LensRules(NamedTuple):
 
 
 _LENS = _LensRules()
-_RIDGE = 1e-9  # of terms that a scene does not show
 _CODE = "other-calibration"
 
 
@@ -86,12 +85,15 @@ class LensCheck:
         if self._frames not in _LENS.looked_at:
             return None
         found = self._share()
+        if self.done:
+            self._matches.clear()
         if found is None:
             return None
         share, sigma = found
         if abs(share) <= max(_LENS.min_share, _LENS.sigmas * sigma) or sigma > _LENS.max_sigma:
             return None
         self._frames = _LENS.looked_at[-1]
+        self._matches.clear()
         index = seen.frame_index
         message = (
             f"frame {index}: rows of near and far points differ as lens distortion makes them, by "
@@ -116,9 +118,9 @@ class LensCheck:
         least = _LENS.least_px / self._camera.fv
         start = np.zeros(terms.shape[1])
         start[2] = median(rows)
-        whole = _robust_fit(terms, rows, least, start, _LENS.steps)
+        whole = cauchy_fit(terms, rows, start, least, _LENS.steps)
         without = [
-            _robust_fit(terms[block != k], rows[block != k], least, whole, _LENS.further_steps)
+            cauchy_fit(terms[block != k], rows[block != k], whole, least, _LENS.further_steps)
             for k in range(_LENS.blocks)
         ]
         sigma = jackknife(np.array(without)[:, :2] @ self._squares)
@@ -142,15 +144,3 @@ def _blocks(ids: IntArray, count: int) -> IntArray:
     before = np.cumsum(matches) - matches
     out: IntArray = (before * count // len(ids))[feature]
     return out
-
-
-def _robust_fit(
-    terms: FloatArray, rows: FloatArray, least: float, start: FloatArray, steps: int
-) -> FloatArray:
-    """The coefficients (13,) that most rows (N,) agree with, from others on; terms (N, 13)."""
-    x = start.copy()
-    for _ in range(steps):
-        residual = (rows - terms @ x)[:, None]
-        equations = cauchy_equations(residual, terms[:, None, :], least)
-        x += np.linalg.solve(equations.matrix + _RIDGE * np.eye(len(x)), equations.vector)
-    return x

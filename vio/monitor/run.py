@@ -22,7 +22,7 @@ from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import OF_THE_STATE, IntegrityMonitor, Mark
-from vio.monitor.lens_distortion import LensCheck, lens_check
+from vio.monitor.lens_distortion import lens_check
 from vio.monitor.still_features import StillFeatures
 from vio.monitor.update_checks import UpdateChecks, UpdatedFrame
 from vio.records import (
@@ -199,8 +199,9 @@ class RunMonitor:
             self._add(self._silence.frame(seen.frame_index, seen.time_ns))
         if self._repeated:
             return
-        if self._lenses is not None:
-            self._look_at_lenses(self._lenses, seen)
+        distorted = None if self._lenses is None else self._lenses.frame(seen)
+        if distorted is not None:
+            self._add([distorted])
         self._frozen.observations(seen)
         held_since = self._frozen.take_held()
         if held_since is not None:
@@ -214,12 +215,6 @@ class RunMonitor:
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
             self._doubt_imu(self._inertial.doubt)
-
-    def _look_at_lenses(self, lenses: LensCheck, seen: Observations) -> None:
-        found = lenses.frame(seen)
-        self._lenses = None if lenses.done else lenses
-        if found is not None:
-            self._add([found])
 
     def _doubt_imu(self, why: str) -> None:
         """Take why the IMU is not to be used for now; nothing: it may be used."""

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from vio.numerics.arrays import FloatArray
 
 _MEDIAN_TO_SIGMA = 1.4826  # standard deviation over median absolute value of a normal distribution
+_RIDGE = 1e-9  # of what the terms of a fit do not show
 
 
 def median(values: npt.ArrayLike) -> float:
@@ -90,6 +91,27 @@ def cauchy_equations(r: FloatArray, J: FloatArray, least: float) -> NormalEquati
     weighted = (J * weight[:, None, None]).reshape(columns.shape)
     variance = float((weight * squared).sum() / (r.shape[1] * weight.sum()))
     return NormalEquations(weighted.T @ columns, weighted.T @ r.reshape(-1), variance)
+
+
+def cauchy_fit(
+    terms: FloatArray, values: FloatArray, start: FloatArray, least: float, steps: int
+) -> FloatArray:
+    """The coefficients (K,) of a linear model that most values (N,) agree with, whatever the others
+    are: Gauss-Newton with the weights of `cauchy_equations`.
+
+    Args:
+        terms: (N, K); what they do not show stays as it begins.
+        values: (N,).
+        start: (K,) to begin with.
+        least: width of a residual, at least.
+        steps: number of them.
+    """
+    x = start.copy()
+    for _ in range(steps):
+        residual = (values - terms @ x)[:, None]
+        equations = cauchy_equations(residual, terms[:, None, :], least)
+        x += np.linalg.solve(equations.matrix + _RIDGE * np.eye(len(x)), equations.vector)
+    return x
 
 
 def jackknife(values: npt.ArrayLike) -> FloatArray:
