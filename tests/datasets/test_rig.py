@@ -757,6 +757,23 @@ def _swapped_ros(folder: Path) -> Path:
     return Path(shutil.move(folder / "spare.yaml", folder / "right.yaml"))
 
 
+def _ros_with_turned_projections(folder: Path) -> Path:
+    """A pair as camera_calibration writes it for fisheye cameras."""
+    m = opencv_matrices()
+    for name, K, D, R, P in (("left", "M1", "D1", "R1", "P1"), ("right", "M2", "D2", "R2", "P2")):
+        projection = np.column_stack([m[K] @ m[R], m[P][:, 3]])
+        (folder / f"{name}.yaml").write_text(ros_yaml(m[K], m[D], m[R], projection, name))
+    return folder
+
+
+def _ros_with_a_transposed_projection(folder: Path) -> Path:
+    m = opencv_matrices()
+    projection = np.column_stack([m["P2"][:, :3].T, m["P2"][:, 3]])
+    write_ros_pair(folder)
+    (folder / "right.yaml").write_text(ros_yaml(m["M2"], m["D2"], m["R2"], projection, "right"))
+    return folder
+
+
 def _lonely_ros(folder: Path) -> Path:
     (write_ros_pair(folder) / "right.yaml").unlink()
     return folder / "left.yaml"
@@ -846,6 +863,14 @@ BAD = {
     ),
     "ROS, one file": (_lonely_ros, "is the calibration of one camera; name the pair"),
     "ROS, swapped": (_swapped_ros, "P gives a stereo baseline of -0.11"),
+    "ROS, fisheye": (
+        _ros_with_turned_projections,
+        "P holds K R in the place of the rectified image's matrix, as camera_calibration",
+    ),
+    "ROS, transposed": (
+        _ros_with_a_transposed_projection,
+        r"right\.yaml: P holds a matrix that is none of a camera, in the place",
+    ),
 }
 
 
