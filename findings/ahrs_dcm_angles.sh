@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# ahrs 0.4.0: roll, pitch and yaw of `DCM` are not those of `Quaternion`. `DCM(rpy=[10, 20, 30])` takes the yaw first: a rotation 33 degrees from `Quaternion(rpy=[10, 20, 30])`.
+# ahrs 0.4.0: roll, pitch and yaw of `DCM` are not those of `Quaternion`. Of 10, 20 and 30 degrees, `DCM(rpy=...)` takes the yaw first: a rotation 33 degrees from that of `Quaternion(rpy=...)`.
 # `DCM.to_rpy` and `to_angles` return the angles of the inverse rotation, (1, -22, -28), so `DCM(rpy=a).to_rpy()` is a in no order, while `Quaternion(rpy=a).to_angles()` is a.
 # Matrix and quaternion of one rotation agree (`to_DCM`, `to_quaternion`): the angles alone differ.
 # Guessed: one package, one meaning of "rpy"; the text of Quaternion.from_rpy says that both classes give the same quaternion of the same angles.
 # Matters here: a filter's attitude as angles, to be compared with a VIO or set as the mounting of an IMU, is another rotation's. A level rig at rest shows signs and order at most; of a rig that is
-# mounted with a roll of 5, a pitch of -10 and a yaw of 90 degrees, the one is 103 degrees from the other, and a VIO with that mounting fails.
+# mounted with a roll of 5, a pitch of -10 and a yaw of 90 degrees, the one is 103 degrees from the other.
 # Source: https://ahrs.readthedocs.io, classes DCM ("angles are given in reverse order") and Quaternion ("With both approaches the same quaternion is obtained"); this run.
 set -euo pipefail
 folder=$(mktemp -d)

@@ -3,8 +3,8 @@
 # of the sensor on the vehicle, `sensor_to_body`, has metres, and so do points (`XYZLut`) and poses. Texts and names have no unit (that of `lidar_origin_to_beam_origin_mm` has).
 # Multiplied as they are, they put the IMU of an OS1 15 m away from the sensor instead of 15 mm.
 # Guessed: homogeneous transforms of one class, of which the product is the pose of the IMU on the vehicle, have one unit; and that of the points.
-# Matters here: it is the lever arm of a lidar's IMU, as a lidar-inertial odometry or a reference for a VIO takes it. At 0.5 rad/s it adds 3.3 m/s^2. The lidar's own offset, 36 mm, becomes 36 m:
-# a height of the map, which an alignment of trajectories hides.
+# Matters here: it is the lever arm of a lidar's IMU, as a lidar-inertial odometry or a reference for a VIO takes it. At 0.5 rad/s it adds 3.3 m/s^2. The offset of the lidar, 36 mm, multiplied so, is 36 m
+# of height, which an alignment of trajectories hides.
 # Source: ouster/sdk/_bindings/client.pyi, SensorInfo; https://github.com/ouster-lidar/ouster-ros, src/os_ros.cpp, whose transform_to_tf_msg multiplies by 1e-3; this run.
 set -euo pipefail
 folder=$(mktemp -d)
@@ -44,7 +44,7 @@ for name, T in (("sensor_to_body", np.eye(4)), ("lidar_to_sensor_transform", lid
 assert abs(moved["sensor_to_body"] - 100) < 1e-3 and abs(moved["lidar_to_sensor_transform"] - 0.1) < 1e-3
 
 arm = (np.eye(4) @ imu)[:3, 3]  # of the IMU, of a sensor in the origin of the vehicle
-print(f"sensor_to_body @ imu_to_sensor_transform: the IMU is {np.linalg.norm(arm):.2f} from the sensor, whose own height is 73 mm;",
+print(f"sensor_to_body @ imu_to_sensor_transform: the IMU is {np.linalg.norm(arm):.2f} from the sensor;",
       f"at 0.5 rad/s that is {0.25 * np.linalg.norm(arm[:2]):.1f} m/s^2, or {0.25 * np.linalg.norm(arm[:2]) / 1000:.4f}")
 assert 14 < np.linalg.norm(arm) < 17
 for name in ("imu_to_sensor_transform", "lidar_to_sensor_transform", "sensor_to_body"):
