@@ -757,12 +757,17 @@ def _swapped_ros(folder: Path) -> Path:
     return Path(shutil.move(folder / "spare.yaml", folder / "right.yaml"))
 
 
-def _ros_with_turned_projections(folder: Path) -> Path:
-    """A pair as camera_calibration writes it for fisheye cameras."""
+def _turned_projection(side: str) -> FloatArray:
+    """P (3, 4) of a camera as ROS's camera_calibration writes it for fisheye cameras."""
     m = opencv_matrices()
-    for name, K, D, R, P in (("left", "M1", "D1", "R1", "P1"), ("right", "M2", "D2", "R2", "P2")):
-        projection = np.column_stack([m[K] @ m[R], m[P][:, 3]])
-        (folder / f"{name}.yaml").write_text(ros_yaml(m[K], m[D], m[R], projection, name))
+    return np.column_stack([m["M" + side] @ m["R" + side], m["P" + side][:, 3]])
+
+
+def _ros_with_turned_projections(folder: Path) -> Path:
+    m = opencv_matrices()
+    for name, side in (("left", "1"), ("right", "2")):
+        K, D, R = (m[key + side] for key in "MDR")
+        (folder / f"{name}.yaml").write_text(ros_yaml(K, D, R, _turned_projection(side), name))
     return folder
 
 
@@ -839,6 +844,10 @@ BAD = {
     ),
     "OpenCV without T": (_storage(T=None, R2=None), "has no T, the pose of the right camera"),
     "OpenCV with a rotation vector": (_storage(R=np.zeros((3, 1))), "R holds 3 numbers"),
+    "OpenCV with the projection of ROS's fisheye pairs": (
+        _storage(R=None, T=None, P2=_turned_projection("2")),
+        "P2 holds K R in the place of the rectified image's matrix",
+    ),
     "OpenCV of larger images": (
         _storage(M2=np.array([[400.0, 0, 70], [0, 400, 24], [0, 0, 1]])),
         "the principal point 70, 24 lies outside images of 64 x 48 pixels; it is the calibration "

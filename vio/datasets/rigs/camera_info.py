@@ -19,7 +19,7 @@ import numpy as np
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import image_size, naming
 from vio.datasets.rigs.opencv import coefficients_of
-from vio.datasets.rigs.plausible import checked_rig
+from vio.datasets.rigs.plausible import check_projection, checked_rig
 from vio.datasets.sides import first_pair, pairs_of
 from vio.datasets.yaml_files import (
     Entries,
@@ -354,7 +354,7 @@ def _rectified_shift(left: CameraInfo, right: CameraInfo) -> FloatArray:
         CalibrationError: it is none of a pair, or the cameras are swapped.
     """
     for info in (left, right):
-        _check_projection(info)
+        check_projection(info.P, info.K @ info.R, f"{info.where}: P")
     offsets = [np.linalg.solve(info.P[:, :3], info.P[:, 3]) for info in (left, right)]
     shift: FloatArray = offsets[1] - offsets[0]
     if (fault := vertical_fault(shift)) is not None:
@@ -362,24 +362,6 @@ def _rectified_shift(left: CameraInfo, right: CameraInfo) -> FloatArray:
     if not shift[0] < 0:
         raise CalibrationError(f"{right.where}: {_no_baseline(left, right, float(-shift[0]))}")
     return shift
-
-
-def _check_projection(info: CameraInfo) -> None:
-    """Refuse a P (3, 4) that is no K' [I | t], so that P[0, 3] is no focal length times baseline.
-
-    ROS's camera_calibration writes K R in the place of K' for pairs of fisheye cameras; the focal
-    length that P[0, 3] was multiplied by is lost (findings/ros_fisheye_baseline.sh).
-    """
-    K = info.P[:, :3]
-    if np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], atol=1e-8):
-        return
-    turned = np.allclose(K, info.K @ info.R, rtol=1e-4, atol=1e-2)
-    raise CalibrationError(
-        f"{info.where}: P holds {'K R' if turned else 'a matrix that is none of a camera,'} in the "
-        "place of the rectified image's matrix"
-        f"{', as camera_calibration writes it for fisheye cameras' if turned else ''}, so P[0, 3] "
-        "tells no baseline; give a calibration with the pair's R and T with --calibration FILE"
-    )
 
 
 def _no_baseline(left: CameraInfo, right: CameraInfo, baseline: float) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import naming
-from vio.datasets.rigs.plausible import checked_rig, unit_doubt
+from vio.datasets.rigs.plausible import check_projection, checked_rig, unit_doubt
 from vio.datasets.sides import side_word
 from vio.datasets.yaml_files import (
     MAX_BYTES,
@@ -256,6 +256,8 @@ def _stereo_pose(entries: Entries, where: str) -> FloatArray:
         )
     R0, R1 = (_required(entries, key, (3, 3), where) for key in ("R0", "R1"))
     P = _required(entries, "P1", None, where)[:3, :4]
+    K1 = _required(entries, "K1", (3, 3), where)
+    check_projection(P, K1 @ R1, f"{where}: {_name(entries, 'P1')}")
     return checked_transform(
         np.column_stack([R1.T @ R0, R1.T @ np.linalg.solve(P[:, :3], P[:, 3])]),
         f"{where}, rectification",

@@ -48,6 +48,34 @@ _FAR_BASELINES = 40.0
 _SQUARES_M = 1.0
 
 
+def check_projection(P: FloatArray, turned: FloatArray, where: str) -> None:
+    """Refuse a projection that is no K' [I | t], so that P[0, 3] is no focal length times baseline.
+
+    ROS's camera_calibration writes K R in the place of K' for pairs of fisheye cameras; the focal
+    length that P[0, 3] was multiplied by is lost (findings/ros_fisheye_baseline.sh).
+
+    Args:
+        P: (3, 4), of a rectified image.
+        turned: K R (3, 3) of the raw camera.
+        where: the matrix, for messages.
+
+    Raises:
+        CalibrationError: it is none.
+    """
+    K = P[:, :3]
+    if np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], atol=1e-8):
+        return
+    if np.allclose(K, turned, rtol=1e-4, atol=1e-2):
+        held, writer = "K R", ", as camera_calibration writes it for fisheye cameras"
+    else:
+        held, writer = "a matrix that is none of a camera,", ""
+    raise CalibrationError(
+        f"{where} holds {held} in the place of the rectified image's matrix{writer}, so its last "
+        "column tells no baseline; give a calibration with the pair's R and T with --calibration "
+        "FILE"
+    )
+
+
 def checked_rig(rig: Rig, where: Path | str, *, size_stated: bool = True) -> Rig:
     """Return a rig with a note where its calibration fits images of another size better.
 
