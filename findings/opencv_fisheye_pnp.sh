@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # OpenCV 4.14.0 and 5.0.0: `fisheye.solvePnP` takes the errors, and `fisheye.solvePnPRansac` its threshold `reprojectionError`, in the pixels of an undistorted image, not in those that it is given.
 # There a pixel of a fisheye image counts 4 times at 60 degrees, 33 times at 80. The default of 8 px lets a point be off by 7 px at 20 degrees from the axis, by 2 px at 60, by 0.2 px at 80. With points
-# as far as 85 degrees out, all within 0.5 px, positions have 4.6 times the error of the best fit to the same pixels; RANSAC throws 9 % of them out, all near the border, and is 2.6 times off.
+# as far as 85 degrees out and noise of 0.5 px, positions have 4.6 times the error of the best fit to the same pixels; RANSAC throws 9 % of them out, and is 2.6 times off.
 # Guessed: "maximum allowed distance between the observed and computed point projections" is one between the image points that were passed in, as it is for `cv2.solvePnPRansac`.
 # Matters here: a fisheye is chosen for what is at its border, and there this counts noise as motion, or deletes points. `vio` calls `cv2.solvePnPRansac` in rectified images alone.
 # Source: the text of fisheye.solvePnPRansac in both versions; its calls of undistortPoints with K as new matrix, then of solvePnP (fisheye.cpp); this run.

@@ -846,7 +846,7 @@ BAD = {
     "OpenCV with a rotation vector": (_storage(R=np.zeros((3, 1))), "R holds 3 numbers"),
     "OpenCV with the projection of ROS's fisheye pairs": (
         _storage(R=None, T=None, P2=_turned_projection("2")),
-        "P2 holds K R in the place of the rectified image's matrix",
+        "P2 holds K R, which camera_calibration writes for fisheye cameras, in the place",
     ),
     "OpenCV of larger images": (
         _storage(M2=np.array([[400.0, 0, 70], [0, 400, 24], [0, 0, 1]])),
@@ -874,11 +874,11 @@ BAD = {
     "ROS, swapped": (_swapped_ros, "P gives a stereo baseline of -0.11"),
     "ROS, fisheye": (
         _ros_with_turned_projections,
-        "P holds K R in the place of the rectified image's matrix, as camera_calibration",
+        "P holds K R, which camera_calibration writes for fisheye cameras, in the place",
     ),
     "ROS, transposed": (
         _ros_with_a_transposed_projection,
-        r"right\.yaml: P holds a matrix that is none of a camera, in the place",
+        r"right\.yaml: P holds a matrix that is none of a camera in the place",
     ),
 }
 

@@ -65,14 +65,12 @@ def check_projection(P: FloatArray, turned: FloatArray, where: str) -> None:
     K = P[:, :3]
     if np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1], atol=1e-8):
         return
+    held = "a matrix that is none of a camera"
     if np.allclose(K, turned, rtol=1e-4, atol=1e-2):
-        held, writer = "K R", ", as camera_calibration writes it for fisheye cameras"
-    else:
-        held, writer = "a matrix that is none of a camera,", ""
+        held = "K R, which camera_calibration writes for fisheye cameras,"
     raise CalibrationError(
-        f"{where} holds {held} in the place of the rectified image's matrix{writer}, so its last "
-        "column tells no baseline; give a calibration with the pair's R and T with --calibration "
-        "FILE"
+        f"{where} holds {held} in the place of the rectified image's matrix, so its last column "
+        "tells no baseline; give a calibration with the pair's R and T with --calibration FILE"
     )
 
 
