@@ -70,7 +70,7 @@ class _EvaluationRules(NamedTuple):
 
 
 _EVALUATIONS = _EvaluationRules()
-# frames in which an IMU that is in doubt may have been wrong: that it was judged by
+# intervals in which an IMU that is in doubt may have been wrong: that it was judged by
 _BEFORE_A_DOUBT = 2 * FIRST_EVALUATION
 
 
@@ -146,7 +146,7 @@ class InertialCheck:
 
     def doubted_since(self, index: int) -> int:
         """The first frame in which an IMU may have been wrong that is in doubt at one."""
-        return max(self.compared_since, index - _BEFORE_A_DOUBT)
+        return max(self.compared_since, index - _BEFORE_A_DOUBT * self._camera.spacing)
 
     def imu(self, samples: Sequence[ImuSample]) -> None:
         """Add samples in order of time."""

@@ -26,6 +26,9 @@ class _TwistRules(NamedTuple):
 
     tracks_per_frame: int = 80  # tracks of a frame that the camera's motion is computed from
     min_links: int = 15  # tracks between two frames
+    # Between the frames that are compared: from one to the next of a fast camera, the errors of pixels
+    # are as large as a slow motion. Up to 30 frames/s every frame counts.
+    min_interval_s: float = 0.03
     max_interval_s: float = 0.25
     same_s: Tolerance[float] = 1e-6  # intervals whose end and start differ by less are contiguous
 
@@ -55,9 +58,16 @@ class CameraTwists:
         self._kept: list[Observations] = []
         self._guess: list[FloatArray] = []
         self._links: list[int] = []
+        self._passed = 0  # frames since the last one that counted
+        self.spacing = 1  # of the frames that count, in frames
 
     def frame(self, seen: Observations) -> Intervals | None:
-        """Add one frame; every `BATCH` frames, return the motions since the last batch."""
+        """Add one frame; every `BATCH` frames that count, return the motions since the last batch."""
+        self._passed += 1
+        if self._kept and self._is_soon(seen.time_ns - self._kept[-1].time_ns):
+            return None
+        self.spacing = self._passed
+        self._passed = 0
         rows = (seen.has_right & ~seen.stale).nonzero()[0]
         if len(rows) > _TWISTS.tracks_per_frame:
             # The same random choice of ids in every frame, so that tracks continue.
@@ -73,6 +83,10 @@ class CameraTwists:
             self._guess.append(self._initial_rotation(last, kept, kept.z[b, :2] - last.z[a, :2]))
         self._kept.append(kept)
         return self.flush() if len(self._kept) > BATCH else None
+
+    def _is_soon(self, interval_ns: int) -> bool:
+        """Whether a frame follows the last one that counts too soon."""
+        return 0 < interval_ns * S_PER_NS < _TWISTS.min_interval_s
 
     def _initial_rotation(
         self, last: Observations, kept: Observations, flow: FloatArray

@@ -17,13 +17,16 @@ import numpy as np
 
 from vio.findings import Finding
 from vio.numerics.robust import median
-from vio.records import Observations, shared_rows
+from vio.records import S_PER_NS, Observations, shared_rows
 
 
 class _ViewRules(NamedTuple):
     """When the view is another one."""
 
     frames: int = 5  # before, whose shares are usual
+    # Before, too: from the first frames on velocity and tilt are still found, in steps that nothing
+    # predicts.
+    begin_s: float = 0.3
     usual_share: float = 0.5  # of a frame's features that the next one shows again, at least
     min_features: int = 30  # of a frame that tells
     # at most, over the usual one; KITTI with half a second cut out: 0.22 and less, rain: 0.32
@@ -52,6 +55,7 @@ class ViewChange:
         # frames since the last one that was apart from its prediction
         self._since_apart = _VIEW.apart_frames
         self._lost: list[int] = []  # frames whose view was another one
+        self._first_ns: int | None = None  # of the first frame
 
     def frame(
         self, seen: Observations, innovation_ratio: float | None, *, measured: bool, imu: bool
@@ -66,6 +70,8 @@ class ViewChange:
                 longer is no shock.
         """
         self._since_apart += 1
+        if self._first_ns is None:
+            self._first_ns = seen.time_ns
         if len(seen) < _VIEW.min_features:
             return []
         frames = self._frames
@@ -83,7 +89,8 @@ class ViewChange:
             self._lost.append(index)
             as_text = _in_order_of_text(self._lost)
             return [_lost(index, (len(frames[-2]), again[-1]), measured=measured, as_text=as_text)]
-        is_apart = imu and _VIEW.apart_sigmas <= sigmas < np.inf
+        begun = (seen.time_ns - self._first_ns) * S_PER_NS >= _VIEW.begin_s
+        is_apart = imu and begun and _VIEW.apart_sigmas <= sigmas < np.inf
         if is_apart and self._since_apart > _VIEW.apart_frames:
             self._since_apart = 0
             return [_apart(seen.frame_index, sigmas)]
