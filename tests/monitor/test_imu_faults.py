@@ -154,6 +154,34 @@ def test_a_range_that_is_exceeded_was_none() -> None:
     assert set(range(501, 1600)) <= set(passed)
 
 
+@pytest.mark.parametrize("size", [1, 7, 1600])
+def test_ends_of_ranges_are_found_alike_in_batches_of_any_size(size: int) -> None:
+    """Six rows of readings at an end that was none, then four at the true one; a live IMU gives
+    its samples one by one.
+    """
+    values = _turning(1600)
+    starts = np.arange(200, 1600, 140)
+    for k, start in enumerate(starts.tolist()):
+        values[start : start + 20, 0] = 2.0 if k < 6 else 3.0
+    samples = _samples(values)
+    check = ImuSampleCheck()
+    passed: list[int] = []
+    for k in range(0, 1600, size):
+        passed += [u.time_ns // 5_000_000 for u in check.take_all(samples[k : k + size])]
+    faults = check.new_faults()
+    assert [fault.start_ns // 5_000_000 for fault in faults if fault.size == 2.0][1:] == (
+        starts[1:6].tolist()
+    )
+    assert [fault.start_ns // 5_000_000 for fault in faults if fault.size == 3.0][1:] == (
+        starts[7:].tolist()
+    )
+    assert len(faults) == len(starts)
+    assert 1600 - len(passed) == 20 * len(starts) - sum(
+        fault.start_ns // 5_000_000 - start
+        for fault, start in zip(faults, starts.tolist(), strict=True)
+    )
+
+
 @pytest.mark.parametrize("step", [0.02, 0.2])
 def test_coarse_steps_are_no_end_of_a_range(step: float) -> None:
     values = np.round(_turning(1600) / step) * step
