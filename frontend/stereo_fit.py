@@ -262,12 +262,15 @@ class StereoFit:
 
         Rows may be far apart where the right camera has been pitched since it was calibrated.
         """
-        tried = range(-ROW_SEARCH.max_rows_half, ROW_SEARCH.max_rows_half + 1)
+        most = max(
+            ROW_SEARCH.max_rows_half, abs(offset)
+        )  # learned rows may go on beyond the search
+        tried = range(-most, most + 1)
         counts = [
             self.count_on_rows(left_half, shifted_rows(right_half, rows), points) for rows in tried
         ]
         best = int(np.argmax(counts))
-        if counts[best] < max(_ROWS.min_points, 2 * counts[offset + ROW_SEARCH.max_rows_half]):
+        if counts[best] < max(_ROWS.min_points, 2 * counts[offset + most]):
             return offset
         self._rows.restart(2.0 * tried[best])
         return tried[best]
