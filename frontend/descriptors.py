@@ -442,9 +442,7 @@ class DescriptorFrontend:
             problem, old.left[rows], p_rows, known, pixels, expected, priors
         )
         # The right pixel belongs to the key point; it is shifted by the refinement.
-        right = pair.right[found] + np.stack(
-            [pixels[:, 0] - left[found, 0], np.zeros(len(found))], axis=1
-        )
+        right = pair.right[found] + pixels - left[found]
         agrees = pair.has_right[found]
         twist = previous.twist_per_s
         if motion is not None:

@@ -134,7 +134,7 @@ class ObjectReport(Finder):
         """Take the motions of a frame; `proven`: a sensor, or points that are older than the event
         that goes on, show that the chosen one is the camera's.
         """
-        self._question(index, motions, proven=proven)
+        self._question(index, proven=proven)
         if motions.object_share == 0.0:
             self._no_object(index, proven=proven)
             return
@@ -158,7 +158,7 @@ class ObjectReport(Finder):
         if (often or self._frames >= _EVENT.frames) and self._reported is None:
             self._report(index, motions)
 
-    def _question(self, index: int, motions: TwoMotions, *, proven: bool) -> None:
+    def _question(self, index: int, *, proven: bool) -> None:
         """Report that what is seen may be the object alone, where it has hidden the scene."""
         self._unproven = 0 if proven or self._reported is None else self._unproven + 1
         if self._unproven < _EVENT.unproven_frames or self._reported == "object-or-scene":

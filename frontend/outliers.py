@@ -32,6 +32,7 @@ from vio.numerics.robust import median
 from vio.records import BoolArray, IntArray
 
 _MIN_DEPTH_M = 0.05
+_LEAST_AHEAD_M = 1e-3  # of the nearest end of an epipolar line's part
 
 
 class _RansacRules(NamedTuple):
@@ -564,6 +565,25 @@ def epipolar_distance(
 
 
 @compiled
+def _least_depth_before(
+    T: FloatArray, ray: tuple[float, float, float], turn: tuple[float, float], near_m: float
+) -> float:
+    """Depth of the nearest point on a ray of unit depth that a motion (4, 4) leaves ahead of the
+    camera: `near_m`, or more where the camera passes that.
+
+    The turn is sine and cosine of the angle of the camera in which it is to be ahead.
+    """
+    x, y, z = ray
+    s, c = turn
+    along = s * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z)
+    along += c * (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z)
+    shift = s * T[1, 3] + c * T[2, 3]
+    if along > 0.0 and near_m * along + shift < _LEAST_AHEAD_M:
+        return (_LEAST_AHEAD_M - shift) / along
+    return near_m
+
+
+@compiled
 def _epipolar_distances(
     camera: CameraArgs,
     T: FloatArray,
@@ -585,12 +605,13 @@ def _epipolar_distances(
             s = np.sin((v - cv) / fv)
             c = np.cos((v - cv) / fv)
             v = cv
+        nearest = _least_depth_before(T, (x, y, z), (s, c), near_m)
         for i in range(2):
-            length, moved = (1.0, 0.0) if i == 0 else (near_m, 1.0)
+            length, moved = (1.0, 0.0) if i == 0 else (nearest, 1.0)
             across = length * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z) + moved * T[0, 3]
             down = length * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) + moved * T[1, 3]
             ahead = length * (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z) + moved * T[2, 3]
-            depth = max(s * down + c * ahead, 1e-3)
+            depth = max(s * down + c * ahead, _LEAST_AHEAD_M)
             end[i, 0] = fu * across / depth + cu
             end[i, 1] = fv * (c * down - s * ahead) / depth + cv
         off_u = u - end[0, 0]

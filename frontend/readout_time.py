@@ -121,11 +121,6 @@ class ReadoutTime(Finder):
         self._open = camera.kind != "mono" and shares.known
         self.readout_s = 0.0  # 0 until a rolling shutter is certain
 
-    @property
-    def is_rolling(self) -> bool:
-        """Whether the shutter is a rolling one, for certain."""
-        return self.readout_s != 0.0
-
     def frame(self, seen: Observations) -> None:
         """Take the features of the next frame as the camera shows them."""
         if not self._open:

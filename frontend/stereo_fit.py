@@ -21,7 +21,6 @@ from vio.frontend.stereo_match import (
     ROW_SEARCH,
     EpipolarRowModel,
     match_rows,
-    mirrored,
     shifted_rows,
 )
 from vio.frontend.tracks import ANCHOR_REACH_PX, INLIER_PX, AnchorBank, Tracks
@@ -262,31 +261,18 @@ class StereoFit:
 
         Rows may be far apart where the right camera has been pitched since it was calibrated.
         """
-        tried = range(-ROW_SEARCH.max_rows_half, ROW_SEARCH.max_rows_half + 1)
+        most = max(
+            ROW_SEARCH.max_rows_half, abs(offset)
+        )  # learned rows may go on beyond the search
+        tried = range(-most, most + 1)
         counts = [
             self.count_on_rows(left_half, shifted_rows(right_half, rows), points) for rows in tried
         ]
         best = int(np.argmax(counts))
-        if counts[best] < max(_ROWS.min_points, 2 * counts[offset + ROW_SEARCH.max_rows_half]):
+        if counts[best] < max(_ROWS.min_points, 2 * counts[offset + most]):
             return offset
         self._rows.restart(2.0 * tried[best])
         return tried[best]
-
-    def count_beyond(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> int:
-        """Count the left pixels (N, 2) that have a good match beyond the present reach: the
-        scene is near.
-        """
-        return len(
-            self._beyond(
-                left.half, shifted_rows(right.half, round(self._rows.offset_px / 2)), points
-            )
-        )
-
-    def count_mirrored(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> int:
-        """Count the left pixels (N, 2) that have a match with a negative disparity."""
-        flipped = mirrored(left.half, right.half, points)
-        disparity, unique = self._search(*flipped, MIN_CORRELATION)
-        return int((unique & (disparity >= 1.0)).sum())
 
     def count_on_rows(self, left_half: Image, right_half: Image, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that match well on their row between two images at half

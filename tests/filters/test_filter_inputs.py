@@ -146,6 +146,16 @@ def test_velocities_and_frames_keep_one_order(make: Callable[[], Filter]) -> Non
         f.propagate(_velocity(1))
 
 
+def test_a_first_frame_before_the_first_velocity_is_refused() -> None:
+    """The state has gone on to the velocity: a step back would take its process noise away."""
+    vislam = _vislam(settings=VislamSettings(motion_model="twist"))
+    vislam.propagate(_velocity(2))
+    with pytest.raises(DataError, match="frame 1 at 100000000 ns is before the last velocity"):
+        vislam.update(_seen(1))
+    vislam.update(_seen(3))
+    assert np.linalg.eigvalsh(vislam.estimate().covariance).min() >= 0.0
+
+
 @pytest.mark.parametrize(("time_ns", "gyro"), [(5, 0.0), (10, 0.0), (20, np.nan), (20, np.inf)])
 def test_imu_samples_out_of_order_or_not_finite_are_refused(time_ns: int, gyro: float) -> None:
     f = _msckf("imu")

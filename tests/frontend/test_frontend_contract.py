@@ -129,11 +129,12 @@ def test_equal_input_gives_identical_output(name: str, ran: Ran) -> None:
 @pytest.mark.parametrize("name", IMAGE_BASED)
 def test_tracks_and_disparities_are_accurate(name: str, ran: Ran) -> None:
     outputs = ran(name)
-    temporal, disparity = [], []
+    temporal, disparity, rows = [], [], []
     for k, pose in enumerate(POSES):
         seen = outputs[k].observations
         stereo = seen.take(seen.has_right)
         disparity.append(stereo.z[:, 2] - truth(SLANTED, pose, stereo.z[:, :2], pose)[:, 2])
+        rows.append(stereo.z[:, 3] - stereo.z[:, 1])
         if k + 1 < len(POSES):
             later = outputs[k + 1].observations
             _, i, j = np.intersect1d(seen.ids, later.ids, return_indices=True)
@@ -144,6 +145,8 @@ def test_tracks_and_disparities_are_accurate(name: str, ran: Ran) -> None:
     assert np.mean(np.concatenate(temporal) > 1) < 0.01
     assert np.median(np.abs(np.concatenate(disparity))) < 0.05
     assert np.mean(np.abs(np.concatenate(disparity)) > 1) < 0.02
+    assert np.median(np.abs(np.concatenate(rows))) < 0.05
+    assert np.mean(np.abs(np.concatenate(rows)) > 1) < 0.02
 
 
 @pytest.mark.parametrize("name", IMAGE_BASED)

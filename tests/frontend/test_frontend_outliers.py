@@ -212,6 +212,22 @@ def test_epipolar_distance_is_zero_at_any_allowed_depth_and_grows_across_the_lin
     np.testing.assert_allclose(shifted, 5.0, atol=1e-6)
 
 
+@pytest.mark.parametrize("forward_m", [0.5, 2.0, 3.5])
+def test_epipolar_distance_is_zero_where_the_camera_passes_the_nearest_depth(
+    forward_m: float,
+) -> None:
+    """As at 35 m/s and 10 images a second: what was nearer than the way is not seen any more."""
+    p = scene(100, 22)
+    T = se3_exp([0.06, 0.02, -forward_m, 0.002, 0.01, 0.001])
+    p = p[transform_points(T, p)[:, 2] > 0.3]
+    assert len(p) > 50
+    before, after = project(CAMERA, p)[:, :2], pixels(T, p, 0, noise=0.0)
+    distance = epipolar_distance(CAMERA, T, before, after, near_m=0.5)
+    np.testing.assert_allclose(distance, 0.0, atol=1e-6)
+    off = epipolar_distance(CAMERA, T, before, before, near_m=0.5)
+    assert np.median(off) > 2.0  # control: what moves with the camera is off the line
+
+
 def test_epipolar_distance_at_standstill_is_the_pixel_distance() -> None:
     before = scene(20, 23)[:, :2] + 100
     distance = epipolar_distance(

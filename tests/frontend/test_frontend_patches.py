@@ -31,6 +31,7 @@ from vio.frontend.stereo_match import EpipolarRowModel, correlate, match_rows
 from vio.frontend.tracks import ANCHOR_RADIUS_PX, AnchorBank, Tracks, new_tracks
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.stereo import StereoCamera, triangulate
+from vio.guard.probe import RowProbe
 from vio.records import BoolArray, Image, IntArray, TrackPrior
 
 
@@ -325,20 +326,15 @@ def test_chance_matches_do_not_make_the_search_reach_further() -> None:
 
 
 def test_a_near_scene_with_repeated_texture_does_not_look_exchanged() -> None:
-    """Each point has its match beyond the reach, and one with a negative disparity within it."""
-    stereo = StereoFit(
-        NEAR_CAMERA, DisparitySettings(), AnchorBank(100, ANCHOR_RADIUS_PX), (300, 200)
-    )
+    """Each point has a match to the left, beyond the usual reach, and one to the right within it."""
     near, again = _moved_right(120.0).full, _moved_right(-15.0).full
     right = np.where(np.arange(300) < 150, near, again)
-    views, points = (
-        [ImageLevels(i, half_image(i)) for i in (PLAIN, right)],
-        POINTS[POINTS[:, 0] > 170],
-    )
-    assert stereo.count_mirrored(*views, points) > 0.7 * len(points)
-    assert stereo.count_beyond(*views, points) > 0.7 * len(points)
-    unlike = [views[0], *(ImageLevels(i, half_image(i)) for i in [picture(np.eye(3), seed=1)])]
-    assert stereo.count_beyond(*unlike, points) < 0.1 * len(points)
+    views, points = [half_image(i) for i in (PLAIN, right)], POINTS[POINTS[:, 0] > 170]
+    probe = RowProbe()
+    assert probe.positive(*views, points) > 0.7 * len(points)
+    assert probe.negative(*views, points) > 0.7 * len(points)
+    unlike = half_image(picture(np.eye(3), seed=1))
+    assert probe.positive(views[0], unlike, points) < 0.1 * len(points)
 
 
 def test_points_beside_the_right_image_or_beyond_the_reach_are_not_testable() -> None:

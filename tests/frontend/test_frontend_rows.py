@@ -6,12 +6,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from tests.frontend.test_frontend_scene import CAMERA, flight, stereo_frame
 from vio.frontend.klt import KltFrontend
+from vio.frontend.settings import DisparitySettings
+from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.stereo_match import EpipolarRowModel, shifted_rows
+from vio.frontend.tracks import AnchorBank
 from vio.records import FrontendOutput, Image
 
 
@@ -45,6 +49,19 @@ def test_rows_that_agree_are_not_searched(monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr(EpipolarRowModel, "restart", refuse)
     assert _run(0)[-1].matched > 50
+
+
+@pytest.mark.parametrize("rows", [40, -40])
+def test_rows_learned_beyond_the_search_are_found_again(rows: int) -> None:
+    """Rows that are followed may go on to where none is searched from zero."""
+    frame = stereo_frame(0, flight(1)[0])
+    left, right = cv2.pyrDown(frame.left), cv2.pyrDown(_moved_down(frame.right, rows))
+    height, width = frame.left.shape
+    points = np.random.default_rng(0).uniform([60, 60], [width - 60, height - 60], (200, 2))
+    fit = StereoFit(CAMERA, DisparitySettings(), AnchorBank(9, 9), (width, height))
+    fit._rows.restart(rows + 2.0)
+    fit._unmatched = 1  # now other rows are tried
+    assert fit.search(left, right, points)[1].mean() > 0.5
 
 
 def test_shifting_rows_repeats_the_last_one() -> None:

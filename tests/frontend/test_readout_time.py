@@ -64,7 +64,7 @@ def _search(frames: list[Observations], stated_s: float = 0.0) -> ReadoutTime:
 @pytest.mark.parametrize("readout_s", [0.005, 0.02, -0.02])
 def test_the_readout_time_is_found(readout_s: float) -> None:
     search = _search([_seen(k, _shaken, readout_s) for k in range(240)])
-    assert search.is_rolling
+    assert search.readout_s
     (finding,) = search.take_findings()
     figures = finding.figures
     assert (finding.code, finding.since) == ("rolling-shutter", 0)
@@ -80,7 +80,7 @@ def test_the_readout_time_is_found(readout_s: float) -> None:
 def test_a_global_shutter_is_known_as_one(noise_px: float) -> None:
     frames = [_seen(k, _shaken, 0.0, noise_px=noise_px) for k in range(240)]
     search = _search(frames)
-    assert not search.is_rolling
+    assert not search.readout_s
     assert not search.take_findings()
     if noise_px < 0.1:
         assert not search._open  # no more work
@@ -98,7 +98,7 @@ def test_a_stated_time_that_is_not_the_cameras_is_named(stated_s: float, readout
     assert (finding.code, finding.effect, finding.since) == ("readout-contradicted", "unusable", 0)
     assert finding.figures["readout_ms"] == pytest.approx(1e3 * readout_s, rel=0.1, abs=0.5)
     assert f"the stated readout time of {1e3 * stated_s:.1f} ms" in finding.message
-    assert not search.is_rolling  # what is stated is used
+    assert not search.readout_s  # what is stated is used
     assert AS_READ.adding(finding) is AS_READ
 
 
@@ -114,7 +114,7 @@ def test_a_stated_time_that_is_about_the_cameras_is_not(readout_s: float) -> Non
 def test_a_steady_velocity_shows_nothing() -> None:
     for readout_s in (0.0, 0.02):
         frames = [_seen(k, _steady, readout_s) for k in range(80)]
-        assert not _search(frames).is_rolling
+        assert not _search(frames).readout_s
         assert not _search(frames, 0.02).take_findings()
 
 
@@ -141,13 +141,13 @@ def test_what_else_moves_pixels_is_no_readout_time() -> None:
         _seen(k, _shaken, 0.0, camera=replace(_CAMERA, fu=294.0, fv=294.0)) for k in range(160)
     ]
     for frames in (jitter, wrong_lens, longer):
-        assert not _search(frames).is_rolling
+        assert not _search(frames).readout_s
 
 
 def test_an_impossible_readout_time_is_none() -> None:
     # rows of a frame are exposed before the next one begins
     frames = [_seen(k, _shaken, 0.09, noise_px=0.02) for k in range(120)]
-    assert not _search(frames).is_rolling
+    assert not _search(frames).readout_s
 
 
 def test_one_camera_and_images_of_unknown_height_are_not_searched() -> None:

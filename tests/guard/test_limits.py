@@ -30,7 +30,7 @@ from vio.guard.turned_pair import TurnedPair
 from vio.records import Image, Observations, StereoFrame, observations
 
 Says = Callable[[float], bool]
-NOTHING = SharedMatches(0, np.arange(0), np.zeros((0, 4)), np.zeros((0, 4)), 0.1)
+NOTHING = SharedMatches(np.arange(0), np.zeros((0, 4)), np.zeros((0, 4)), 0.1)
 SHAPE = (120, 160)
 
 
@@ -257,7 +257,7 @@ def _moving_again(share: float) -> list[str]:
     seen = _rows(0, 30, 0.0, 0.0)
     for right in [0.0] * 3 + [share]:
         now = np.full((30, 4), 100.0) + np.array([10.0, 0.0, 10.0 * right, 0.0])
-        check.inspect(seen, SharedMatches(30, np.arange(30), np.full((30, 4), 100.0), now, 0.1))
+        check.inspect(seen, SharedMatches(np.arange(30), np.full((30, 4), 100.0), now, 0.1))
     return _codes(check.take_findings())
 
 

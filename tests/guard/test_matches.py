@@ -330,7 +330,7 @@ def test_what_disparities_have_in_common_is_known_as_well_as_stated(nearest_m: f
             right = left - np.column_stack([150.0 / p[:, 2], np.zeros(len(p))])
             both.append(np.hstack([left, right]) + rng.normal(0.0, 0.2, (len(p), 4)))
         both[1][:, 2] += 1.5 * (1.0 + ((both[1][:, 2] - 320.0) / 500.0) ** 2)
-        found = common_change(CAMERA, SharedMatches(80, np.arange(80), *both, 0.1))
+        found = common_change(CAMERA, SharedMatches(np.arange(80), *both, 0.1))
         assert found is not None
         ratios.append((found[0] + 1.5) / found[1])
         sigmas.append(found[1])
@@ -510,7 +510,6 @@ def test_shared_matches_are_those_of_both_frames() -> None:
     now = observations(1, STEP_NS, [4, 2, 1], z, [True, True, False])
     shared = shared_matches(before, now)
     assert isinstance(shared, SharedMatches)
-    assert shared.had_right == 2
     assert shared.rows.tolist() == [1]
     np.testing.assert_array_equal(shared.before, z[[1]])
     assert shared.seconds == pytest.approx(0.1)
@@ -519,7 +518,7 @@ def test_shared_matches_are_those_of_both_frames() -> None:
 def _shared(count: int, left_px: float, right_px: float) -> SharedMatches:
     before = np.full((count, 4), 100.0)
     now = before + np.array([left_px, 0.0, right_px, 0.0])
-    return SharedMatches(count, np.arange(count), before, now, 0.1)
+    return SharedMatches(np.arange(count), before, now, 0.1)
 
 
 def _frozen_frames(shared: SharedMatches) -> list[str]:

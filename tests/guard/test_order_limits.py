@@ -225,7 +225,7 @@ def _frozen(left_px: float = 10.0, right_px: float = 0.0, count: int = 30) -> bo
     before = np.full((count, 4), 100.0)
     now = before + np.array([left_px, 0.0, right_px, 0.0])
     for _ in range(4):
-        shared = SharedMatches(count, np.arange(count), before, now, 0.1)
+        shared = SharedMatches(np.arange(count), before, now, 0.1)
         check.inspect(_rows(0, count, 0.0, 0.0), shared)
     return bool(check.take_findings())
 

@@ -4,6 +4,7 @@ the poses.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -12,12 +13,14 @@ import numpy as np
 import pytest
 
 from tests.filters.test_msckf import CAMERA, T_CAM0_IMU, Flight
+from vio.filters.navigation import ImuMotion
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
 from vio.imu.clocks import SampleCoverage
 from vio.imu.faults import ImuSampleCheck
 from vio.imu.sampling import sampling_notes
 from vio.live.processor import EventOrder
+from vio.monitor.imu_faults import ImuFaultReport
 from vio.monitor.run import RunMonitor
 from vio.monitor.samples import Samples
 from vio.records import Event, ImuRecord, ImuSample, IntArray, StereoFrame
@@ -152,6 +155,52 @@ def test_a_range_that_is_exceeded_was_none() -> None:
     values[held, 0] = np.clip(values[held, 0], -0.7, 0.7)
     passed, _ = _passed(_samples(values))
     assert set(range(501, 1600)) <= set(passed)
+
+
+@pytest.mark.parametrize("size", [1, 7, 1600])
+def test_ends_of_ranges_are_found_alike_in_batches_of_any_size(size: int) -> None:
+    """Six rows of readings at an end that was none, then four at the true one; a live IMU gives
+    its samples one by one.
+    """
+    values = _turning(1600)
+    starts = np.arange(200, 1600, 140)
+    for k, start in enumerate(starts.tolist()):
+        values[start : start + 20, 0] = 2.0 if k < 6 else 3.0
+    samples = _samples(values)
+    check = ImuSampleCheck()
+    passed: list[int] = []
+    for k in range(0, 1600, size):
+        passed += [u.time_ns // 5_000_000 for u in check.take_all(samples[k : k + size])]
+    faults = check.new_faults()
+    assert [fault.start_ns // 5_000_000 for fault in faults if fault.size == 2.0][1:] == (
+        starts[1:6].tolist()
+    )
+    assert [fault.start_ns // 5_000_000 for fault in faults if fault.size == 3.0][1:] == (
+        starts[7:].tolist()
+    )
+    assert len(faults) == len(starts)
+    assert 1600 - len(passed) == 20 * len(starts) - sum(
+        fault.start_ns // 5_000_000 - start
+        for fault, start in zip(faults, starts.tolist(), strict=True)
+    )
+
+
+def test_neither_filter_nor_report_keeps_each_fault() -> None:
+    """A gyro at the end of its range at every turn of a vibration has many in a second."""
+    values = _turning(4000)
+    values[np.arange(4000) % 20 < 8, 0] = 2.0
+    samples = _samples(values)
+    motion, report = ImuMotion(MsckfSettings()), ImuFaultReport()
+    sizes = []
+    for part in (samples[:2000], samples[2000:]):
+        for sample in part:
+            motion.take(sample)
+            assert len(motion.samples) <= len(part)  # which takes what is new
+            report.samples([sample])
+        motion._kept.clear()
+        sizes.append(len(pickle.dumps((motion._check, report))))
+    assert "2 rad/s, 198 times" in report.finish()[0].message
+    assert sizes[1] < sizes[0] + 1000
 
 
 @pytest.mark.parametrize("step", [0.02, 0.2])

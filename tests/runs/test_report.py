@@ -23,9 +23,10 @@ from vio.geometry.lie import se3_from_parts, so3_exp
 from vio.geometry.upright import attitude_deg, up_of, upright_axes
 from vio.records import LoopEvent, MapKeyframes
 from vio.report.compared import apart, compared_figures
+from vio.report.figures import sections
 from vio.report.page import page
 from vio.report.words import run_figures, summary
-from vio.runs.curves import curves_of
+from vio.runs.curves import COLOURS, curves_of
 from vio.runs.finished import _read_frames, read_finished_run, with_distinct_names
 
 BROWSER = (
@@ -111,6 +112,15 @@ def test_a_page_needs_no_network_and_shows_every_part(runs: tuple[Path, Path]) -
     )
     assert "All settings have their defaults" not in text  # --motion is one
     assert "<h2>IMU biases</h2>" not in page([read_finished_run(runs[1])])
+
+
+def test_more_runs_than_colours_are_all_drawn(runs: tuple[Path, Path]) -> None:
+    run = read_finished_run(runs[0])
+    many = [replace(run, name=f"run {k}") for k in range(len(COLOURS) + 1)]
+    for section in sections(many, curves_of(many)):
+        if section.title in ("Path", "Position and height", "IMU biases", "Features"):
+            names = " ".join(str(trace.name) for trace in section.figure.data)
+            assert all(each.name in names for each in many), section.title
 
 
 def test_a_run_with_a_map_is_drawn_in_it_with_its_loops(runs: tuple[Path, Path]) -> None:

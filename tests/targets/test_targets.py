@@ -49,7 +49,7 @@ from vio.targets.bundle import (
     lens_moved,
 )
 from vio.targets.calibrate import calibrate_cameras
-from vio.targets.corners import BoolArray, CornerDetector, Corners, subpixel
+from vio.targets.corners import NO_CORNERS, BoolArray, CornerDetector, Corners, subpixel
 from vio.targets.description import Target, marker_dictionary, read_target, target_text
 from vio.targets.homography import predict
 from vio.targets.lenses import LENSES, choose_lens
@@ -493,6 +493,16 @@ def test_halves_that_agree_inflate_nothing() -> None:
         assert verdict.inflation == 1
         ratios.append(verdict.halves.ratio)
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1, abs=0.2)
+
+
+def test_halves_have_all_cameras_where_every_other_view_lacks_one() -> None:
+    views = [
+        replace(view, corners=(view.corners[0], NO_CORNERS)) if number % 2 else view
+        for number, view in enumerate(made_views(3, 24))
+    ]
+    verdict = calibrate_cameras(_filmed(views), GRID, "radtan").verdict
+    assert verdict.inflation == 1
+    assert verdict.findings == ()
 
 
 def test_depth_has_a_sigma_where_views_leave_a_focal_length_free() -> None:

@@ -290,7 +290,7 @@ def _effects(
     for metric in metrics:
         cases = _cases(own, metric, drawn_each_seed)
         if cases:
-            yield metric, effect_of([float(np.mean(v)) for v in cases.values()], metric)
+            yield metric, effect_of([float(np.mean(v)) for v in cases.values()])
 
 
 def _cases(
@@ -312,7 +312,7 @@ def _cases(
     return logs
 
 
-def effect_of(logs: npt.ArrayLike, metric: Metric = _PRIMARY) -> Effect:
+def effect_of(logs: npt.ArrayLike) -> Effect:
     """Return the effect of log ratios (N,), one of each independent case."""
     from scipy import stats
 

@@ -126,12 +126,12 @@ class InputOrder:
         self._sample_ns = before_ns
         return True
 
-    def frame(self, seen: Observations, reached_ns: int) -> None:
+    def frame(self, seen: Observations, reached_ns: int | None) -> None:
         """Check the observations of a frame.
 
         Args:
             seen: the observations.
-            reached_ns: time of the filter's state.
+            reached_ns: time of the filter's state; None: it has none yet.
 
         Raises:
             DataError: the frame is not after the last one or before the state, an id occurs twice,
@@ -145,7 +145,7 @@ class InputOrder:
                 f"{where} at {now} ns is not after the last frame ({before} ns); give frames in "
                 "order of time"
             )
-        if before is not None and now < reached_ns:
+        if reached_ns is not None and now < reached_ns:
             raise DataError(
                 f"{where} at {now} ns is before the last velocity ({reached_ns} ns); give both in "
                 "order of time"

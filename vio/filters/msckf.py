@@ -193,7 +193,8 @@ class Msckf(Backend):
             DataError: the frame is out of order, or its observations are impossible; the filter is
                 unchanged.
         """
-        self._order.frame(observations, self._propagation.time_ns)
+        reached_ns = None if self._window is None else self._propagation.time_ns
+        self._order.frame(observations, reached_ns)
         return self._update(observations)
 
     def _update(self, observations: Observations) -> UpdateReport:

@@ -189,6 +189,7 @@ class ImuMotion:
         """
         if self._new:
             usable = self._check.take_all(self._new)
+            self._check.new_faults()  # which the monitor reports, are not kept
             self._new = []
             self._kept += usable
             self._history.take(usable)

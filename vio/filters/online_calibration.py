@@ -44,7 +44,6 @@ _NOISE_ONLY = float(chi_square_quantile(0.999, 3))
 class _Walks(NamedTuple):
     """Random walks of a mount that gives and of clocks that drift, each per root second."""
 
-    # Random walks of a mount that gives and of clocks that drift, each per root second.
     extrinsic_rotation_deg: float = 2.0e-3
     extrinsic_translation_m: float = 1.0e-4
     time_offset_s: float = 2.0e-6
@@ -104,6 +103,7 @@ class Twist:
         return out
 
 
+_MEANS = ("T_cam0_imu", "time_offset_s", "stereo", "R_upright_world")  # of a calibration
 NO_TWIST = Twist(np.zeros(6), np.zeros((6, 6)))
 
 
@@ -150,17 +150,12 @@ class Calibration:
         """Return the calibration moved by an error (C,), the body's pose (4, 4) being that of
         the error.
         """
-        changed: dict[str, Any] = {
-            "T_cam0_imu": self.T_cam0_imu,
-            "time_offset_s": self.time_offset_s,
-            "stereo": self.stereo,
-            "R_upright_world": self.R_upright_world,
-        }
+        means: dict[str, Any] = {name: getattr(self, name) for name in _MEANS}
         first = 0
         for name, size in self.estimated.items():
-            BLOCKS[name].correct(self, error[first : first + size], T_world_imu, changed)
+            BLOCKS[name].correct(means, error[first : first + size], T_world_imu)
             first += size
-        return Calibration(**changed, estimated=self.estimated)
+        return Calibration(**means, estimated=self.estimated)
 
     def variances(self, of_block: dict[str, FloatArray]) -> FloatArray:
         """Join variances, given by block, of the blocks that are estimated (C,)."""
@@ -256,7 +251,7 @@ class CalibrationBlock:
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
         """Whether it is estimated from the start, with given motion samples."""
-        raise NotImplementedError
+        return False
 
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
         """Initial standard deviations (n,)."""
@@ -266,17 +261,10 @@ class CalibrationBlock:
         """Random walks (n,), standard deviations per root second."""
         return self.sigmas(settings) * self.walk
 
-    def correct(
-        self,
-        calibration: Calibration,
-        error: FloatArray,
-        T_world_imu: FloatArray,
-        changed: dict[str, Any],
-    ) -> None:
-        """Put the fields of a calibration that an error (n,) at a pose of the body (4, 4) moves
-        into `changed`.
+    def correct(self, means: dict[str, Any], error: FloatArray, T_world_imu: FloatArray) -> None:
+        """Move the means of a calibration, by field, by an error (n,) at a pose of the body (4, 4):
+        replace those that it moves.
         """
-        raise NotImplementedError
 
     def report(
         self, calibration: Calibration, nav: NavState, covariance: FloatArray
@@ -284,7 +272,7 @@ class CalibrationBlock:
         """Return the fields of `Estimate` with mean and uncertainty, by the covariance (n, n) of
         the errors.
         """
-        raise NotImplementedError
+        return {}
 
     def moved_by(self, T: FloatArray) -> FloatArray:
         """How its errors follow a motion (4, 4) of the body on the world's side (n, n), where they
@@ -325,15 +313,6 @@ class _ImuTermsBlock(CalibrationBlock):
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
         return term_sigmas()[chosen_terms(settings)]
 
-    def correct(
-        self,
-        calibration: Calibration,
-        error: FloatArray,
-        T_world_imu: FloatArray,
-        changed: dict[str, Any],
-    ) -> None:
-        """Nothing of the calibration moves."""
-
     def report(
         self, calibration: Calibration, nav: NavState, covariance: FloatArray
     ) -> dict[str, Any]:
@@ -351,17 +330,11 @@ class StereoBlock(CalibrationBlock):
     enters = "pixels"
     walk = _WALKS.stereo_share
 
-    def correct(
-        self,
-        calibration: Calibration,
-        error: FloatArray,
-        T_world_imu: FloatArray,
-        changed: dict[str, Any],
-    ) -> None:
-        """Put the coefficients moved by an error (n,) of some of them into `changed`."""
-        if changed["stereo"] is calibration.stereo:
-            changed["stereo"] = calibration.stereo.copy()
-        changed["stereo"][self.terms] += error
+    def correct(self, means: dict[str, Any], error: FloatArray, T_world_imu: FloatArray) -> None:
+        """Move the coefficients of the block."""
+        stereo = means["stereo"].copy()
+        stereo[self.terms] += error
+        means["stereo"] = stereo
 
 
 class _StereoFieldBlock(StereoBlock):
@@ -371,9 +344,6 @@ class _StereoFieldBlock(StereoBlock):
 
     name = "stereo_field"
     terms = slice(0, FIELD_TERMS)
-
-    def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
-        return False
 
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
         return stereo_field_sigmas(MAX_FIELD_SIGMA, stereo_yaw_rad(settings))
@@ -426,15 +396,9 @@ class _ExtrinsicsBlock(CalibrationBlock):
             [_WALKS.extrinsic_translation_m, np.radians(_WALKS.extrinsic_rotation_deg)], 3
         )
 
-    def correct(
-        self,
-        calibration: Calibration,
-        error: FloatArray,
-        T_world_imu: FloatArray,
-        changed: dict[str, Any],
-    ) -> None:
-        moved = calibration.T_cam0_imu @ se3_exp(se3_adjoint(se3_inverse(T_world_imu)) @ error)
-        changed["T_cam0_imu"] = moved
+    def correct(self, means: dict[str, Any], error: FloatArray, T_world_imu: FloatArray) -> None:
+        moved = se3_exp(se3_adjoint(se3_inverse(T_world_imu)) @ error)
+        means["T_cam0_imu"] = means["T_cam0_imu"] @ moved
 
     def report(
         self, calibration: Calibration, nav: NavState, covariance: FloatArray
@@ -473,14 +437,8 @@ class _TimeOffsetBlock(CalibrationBlock):
     def walks(self, settings: MsckfSettings) -> FloatArray:
         return np.array([_WALKS.time_offset_s])
 
-    def correct(
-        self,
-        calibration: Calibration,
-        error: FloatArray,
-        T_world_imu: FloatArray,
-        changed: dict[str, Any],
-    ) -> None:
-        changed["time_offset_s"] = calibration.time_offset_s + float(error[0])
+    def correct(self, means: dict[str, Any], error: FloatArray, T_world_imu: FloatArray) -> None:
+        means["time_offset_s"] += float(error[0])
 
     def report(
         self, calibration: Calibration, nav: NavState, covariance: FloatArray
@@ -508,25 +466,11 @@ class _FirstAttitudeBlock(CalibrationBlock):
     name = "first_attitude"
     enters = "camera"  # behind all others; nothing depends on it
 
-    def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
-        return False
-
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
         return np.zeros(3)
 
-    def correct(
-        self,
-        calibration: Calibration,
-        error: FloatArray,
-        T_world_imu: FloatArray,
-        changed: dict[str, Any],
-    ) -> None:
-        changed["R_upright_world"] = so3_exp(error) @ calibration.R_upright_world
-
-    def report(
-        self, calibration: Calibration, nav: NavState, covariance: FloatArray
-    ) -> dict[str, Any]:
-        return {}
+    def correct(self, means: dict[str, Any], error: FloatArray, T_world_imu: FloatArray) -> None:
+        means["R_upright_world"] = so3_exp(error) @ means["R_upright_world"]
 
 
 _ALL = (

@@ -252,7 +252,7 @@ class Vislam(Backend):
             DataError: the frame is out of order, or its observations are impossible; the filter is
                 unchanged.
         """
-        self._order.frame(observations, self._time_ns or 0)
+        self._order.frame(observations, self._time_ns)
         step_s = (
             0.0
             if self._frame_time_ns is None

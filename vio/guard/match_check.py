@@ -19,7 +19,6 @@ from vio.records import BoolArray, IntArray, Observations, shared_rows
 class SharedMatches:
     """The features of a frame that had a right pixel in the frame before as well."""
 
-    had_right: int  # features of both frames that had a right pixel in the one before
     rows: IntArray  # (K,) of those that have one in both, in the frame
     before: FloatArray  # (K, 4) pixels [ul vl ur vr] in the frame before
     now: FloatArray  # (K, 4) likewise in the frame
@@ -33,12 +32,10 @@ def shared_matches(before: Observations | None, now: Observations) -> SharedMatc
     """Return the right matches that two frames share, by the features' ids."""
     if before is None:
         nothing = np.zeros((0, 4))
-        return SharedMatches(0, np.zeros(0, dtype=np.int64), nothing, nothing, 0.0)
+        return SharedMatches(np.zeros(0, dtype=np.int64), nothing, nothing, 0.0)
     old, new = shared_rows(before.ids, now.ids)
-    had = before.has_right[old]
-    both = had & now.has_right[new]
+    both = before.has_right[old] & now.has_right[new]
     return SharedMatches(
-        int(had.sum()),
         new[both],
         before.z[old[both]],
         now.z[new[both]],

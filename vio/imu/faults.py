@@ -123,8 +123,8 @@ class ImuSampleCheck:
             return []
         readings = readings_of(samples)
         clipped = self._ranges.take(readings)
+        self._faults += self._ranges.faults(samples, readings, clipped)
         if clipped.any():
-            self._faults += self._ranges.faults(samples, clipped)
             left_out = np.any(clipped, axis=1)
             samples = [x for x, out in zip(samples, left_out.tolist(), strict=True) if not out]
             readings = readings[~left_out]
@@ -323,20 +323,23 @@ class _Ranges:
         _mark_clipped(readings, known, _FAULTS.min_history, clipped)
         return clipped
 
-    def faults(self, samples: Sequence[ImuSample], clipped: BoolArray) -> list[ImuFault]:
+    def faults(
+        self, samples: Sequence[ImuSample], readings: FloatArray, clipped: BoolArray
+    ) -> list[ImuFault]:
         """Return a fault for each row of samples (K,) at the end of a range, (K, 2), that begins
-        here.
+        here; their readings are (K, 6).
         """
+        before = self._are_clipped
+        self._are_clipped = clipped[-1].tolist()
         found: list[ImuFault] = []
+        if not clipped.any():
+            return found
         for sensor, kind in enumerate(_CLIPPED):
             own = clipped[:, sensor]
-            if not own.any():
-                continue
-            began = own & ~np.concatenate([[self._are_clipped[sensor]], own[:-1]])
-            self._are_clipped[sensor] = bool(own[-1])
-            end = float(self._ends[sensor])
-            times = [samples[k].time_ns for k in np.flatnonzero(began).tolist()]
-            found += [ImuFault(kind, time_ns, time_ns, end) for time_ns in times]
+            began = own & ~np.concatenate([[before[sensor]], own[:-1]])
+            for k in np.flatnonzero(began).tolist():
+                end = float(np.abs(readings[k, 3 * sensor : 3 * sensor + 3]).max())
+                found.append(ImuFault(kind, samples[k].time_ns, samples[k].time_ns, end))
         return found
 
 
@@ -349,42 +352,19 @@ def _mark_clipped(
     """
     n = len(readings)
     equal = np.empty((n, 6), dtype=np.bool_)
-    at_end = np.empty((n, 6), dtype=np.bool_)
+    at_end = np.empty(6, dtype=np.bool_)
     _mark_repeated(readings, known, equal)
     for sensor in range(2):
-        known_from = _learn_end(readings, equal, at_end, known, sensor, min_history)
+        first = 3 * sensor
         for k in range(n):
-            reaches = _reaches(readings[k], 3 * sensor, known.ends[sensor])
-            clipped[k, sensor] = k >= known_from and reaches
+            if _is_beyond(readings[k], first, known.ends[sensor]):
+                known.ends[sensor] = np.inf
+            _mark_at_end(readings[k], equal[k], first, known.extreme, at_end)
+            if known.ends[sensor] == np.inf:
+                _learn_end(readings, k, at_end, known, sensor, min_history)
+            clipped[k, sensor] = _reaches(readings[k], first, known.ends[sensor])
+            _count_changes(equal[k], at_end, first, known)
     _remember(readings, known)
-
-
-@compiled
-def _learn_end(
-    readings: FloatArray,
-    equal: BoolArray,
-    at_end: BoolArray,
-    known: _KnownRanges,
-    sensor: int,
-    min_history: int,
-) -> int:
-    """Learn from readings where a sensor's range ends, and write which of its numbers repeat the
-    largest one so far; return the first reading from which on the end is known.
-    """
-    first = 3 * sensor
-    if _is_beyond(readings, first, known.ends[sensor]):
-        known.ends[sensor] = np.inf
-    is_unknown = known.ends[sensor] == np.inf
-    learns = _mark_at_end(readings, equal, first, known.extreme, at_end) and is_unknown
-    if is_unknown and not learns:
-        _clear(first, known.repeats)
-    known_from = 0
-    for k in range(len(readings)):
-        if learns and _finds_end(readings, k, at_end, known, sensor, min_history):
-            known_from = k
-            learns = False
-        _count_changes(equal[k], at_end[k], first, known)
-    return known_from
 
 
 @compiled
@@ -397,46 +377,41 @@ def _mark_repeated(readings: FloatArray, known: _KnownRanges, equal: BoolArray) 
 
 
 @compiled
-def _is_beyond(readings: FloatArray, first: int, end: float) -> bool:
-    """Whether some reading of a sensor, whose axes begin at `first`, shows that its range does not
-    end there.
+def _is_beyond(reading: FloatArray, first: int, end: float) -> bool:
+    """Whether a reading of a sensor, whose axes begin at `first`, shows that its range does not end
+    there.
     """
-    for k in range(len(readings)):
-        for i in range(first, first + 3):
-            if abs(readings[k, i]) > (1 + _RANGE_SLACK) * end:
-                return True
-    return False
+    beyond = False
+    for i in range(first, first + 3):
+        beyond = beyond or abs(reading[i]) > (1 + _RANGE_SLACK) * end
+    return beyond
 
 
 @compiled
 def _mark_at_end(
-    readings: FloatArray, equal: BoolArray, first: int, extreme: FloatArray, at_end: BoolArray
-) -> bool:
-    """Write which numbers of a sensor repeat the largest one so far while another axis changes;
-    return whether any does.
+    reading: FloatArray, equal: BoolArray, first: int, extreme: FloatArray, at_end: BoolArray
+) -> None:
+    """Write which numbers (6,) of a sensor repeat the largest one so far while another axis
+    changes.
     """
-    any_at_end = False
-    for k in range(len(readings)):
-        all_equal = equal[k, first] and equal[k, first + 1] and equal[k, first + 2]
-        for i in range(first, first + 3):
-            size = abs(readings[k, i])
-            if size > extreme[i]:
-                extreme[i] = size
-            at_end[k, i] = equal[k, i] and size >= extreme[i] and size > 0 and not all_equal
-            any_at_end = any_at_end or at_end[k, i]
-    return any_at_end
+    all_equal = equal[first] and equal[first + 1] and equal[first + 2]
+    for i in range(first, first + 3):
+        size = abs(reading[i])
+        if size > extreme[i]:
+            extreme[i] = size
+        at_end[i] = equal[i] and size >= extreme[i] and size > 0 and not all_equal
 
 
 @compiled
-def _finds_end(
+def _learn_end(
     readings: FloatArray,
     k: int,
     at_end: BoolArray,
     known: _KnownRanges,
     sensor: int,
     min_history: int,
-) -> bool:
-    """Whether reading k shows the end of a sensor's range, which is then noted.
+) -> None:
+    """Note the end of a sensor's range if reading k shows it.
 
     An axis that repeats its largest reading more often than its repetitions so far make probable,
     while another axis of the sensor goes to and fro, is at the end of the range.
@@ -445,23 +420,15 @@ def _finds_end(
     seen = known.counts[0] + k
     largest = 0.0
     for i in range(first, first + 3):
-        known.repeats[i] = known.repeats[i] + 1 if at_end[k, i] else 0
-        if at_end[k, i] and seen >= min_history and known.changed[i] >= min_history:
+        known.repeats[i] = known.repeats[i] + 1 if at_end[i] else 0
+        if at_end[i] and seen >= min_history and known.changed[i] >= min_history:
             share = (known.unchanged[i] + 1) / (seen + 2)
             if known.repeats[i] * np.log(share) < _LOG_MIN_CHANCE:
                 largest = max(largest, abs(readings[k, i]))
-    if largest == 0 or not _has_noise(known.recent, known.counts[1], readings, k, at_end, first):
-        return False
-    known.ends[sensor] = largest
-    _clear(first, known.repeats)
-    return True
-
-
-@compiled
-def _clear(first: int, repeats: IntArray) -> None:
-    """Forget how often the axes of a sensor repeated their largest reading."""
-    for i in range(first, first + 3):
-        repeats[i] = 0
+    if largest > 0 and _has_noise(known.recent, known.counts[1], readings, k, at_end, first):
+        known.ends[sensor] = largest
+        for i in range(first, first + 3):
+            known.repeats[i] = 0
 
 
 @compiled
@@ -516,7 +483,7 @@ def _has_noise(
             change = there - here
             turns += (before < 0 and change > 0) or (before > 0 and change < 0)
             before = change
-        if turns >= _MIN_TURNS and not at_end[k, i]:
+        if turns >= _MIN_TURNS and not at_end[i]:
             return True
     return False
 

@@ -54,7 +54,8 @@ class ImuFaultReport:
         self._frame = 0
         self._frames = _FrameTimes()
         self._samples = 0
-        self._spikes: dict[ImuFaultKind, list[ImuFault]] = {}
+        self._counts: dict[ImuFaultKind, int] = {}  # of spikes, and of rows at the end of a range
+        self._largest: dict[ImuFaultKind, float] = {}  # of their sizes
 
     def frame(self, index: int, time_ns: int) -> None:
         """Take the number and stamp of a frame before the samples up to it, for their lines; again
@@ -77,22 +78,22 @@ class ImuFaultReport:
     def finish(self) -> list[Finding]:
         """Return the findings at the end of the run."""
         findings = self._found(self._check.new_faults())
-        for kind, spikes in self._spikes.items():
-            if len(spikes) > 1 and kind in _RANGES:
+        for kind, count in self._counts.items():
+            if count == 1:
+                continue
+            largest = self._largest[kind]
+            if kind in _RANGES:
                 sensor, unit = _RANGES[kind]
                 line = (
-                    f"the {sensor} was at the end of its range, {spikes[0].size:.4g} {unit}, "
-                    f"{len(spikes)} times; these samples were left out"
+                    f"the {sensor} was at the end of its range, {largest:.4g} {unit}, {count} times; "
+                    "these samples were left out"
                 )
-                findings.append(Finding(_code(kind), line, self._frame))
-            elif len(spikes) > 1:
-                largest = max(fault.size for fault in spikes)
+            else:
                 line = (
-                    f"{len(spikes)} of {self._samples} IMU samples were {kind}s, the largest "
-                    f"{largest:.3g} "
-                    f"{_UNITS[kind]}; they were left out"
+                    f"{count} of {self._samples} IMU samples were {kind}s, the largest "
+                    f"{largest:.3g} {_UNITS[kind]}; they were left out"
                 )
-                findings.append(Finding(_code(kind), line, self._frame))
+            findings.append(Finding(_code(kind), line, self._frame))
         return findings
 
     def _found(self, faults: Iterable[ImuFault]) -> list[Finding]:
@@ -126,8 +127,9 @@ class ImuFaultReport:
         return Finding(code, message, self._frame, ended=True)
 
     def _line(self, fault: ImuFault) -> list[str]:
-        self._spikes.setdefault(fault.kind, []).append(fault)
-        if len(self._spikes[fault.kind]) > 1:
+        self._counts[fault.kind] = self._counts.get(fault.kind, 0) + 1
+        self._largest[fault.kind] = max(self._largest.get(fault.kind, 0.0), fault.size)
+        if self._counts[fault.kind] > 1:
             return []
         if fault.kind in _RANGES:
             sensor, unit = _RANGES[fault.kind]

@@ -19,6 +19,7 @@ from vio.runs.curves import (
     Curves,
     Truth,
     binned,
+    colours,
     stereo_curves,
     thinned,
 )
@@ -93,7 +94,7 @@ def _paths(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSecti
                 column,
                 width=3,
             )
-        for run, curve, colour in zip(runs, curves, COLOURS, strict=False):
+        for run, curve, colour in zip(runs, curves, colours(len(runs)), strict=True):
             if curve.dead_reckoning is not None:
                 if len(runs) == 1:
                     label = "dead reckoning"
@@ -130,7 +131,7 @@ def _path_3d(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSec
     paths = [("ground truth", truth.position, _TRUTH, 5) for truth in _truths(curves)]
     paths += [
         (run.name, c.position, colour, 3)
-        for run, c, colour in zip(runs, curves, COLOURS, strict=False)
+        for run, c, colour in zip(runs, curves, colours(len(runs)), strict=True)
     ]
     for label, p, colour, width in paths:
         x, y, z = (_short(p[:, axis]) for axis in range(3))
@@ -172,7 +173,7 @@ def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Repor
     """Draw the runs that had a map in it, from above, with keyframes and loops."""
     chosen = [
         (r, c.mapped, colour)
-        for r, c, colour in zip(runs, curves, COLOURS, strict=False)
+        for r, c, colour in zip(runs, curves, colours(len(runs)), strict=True)
         if c.mapped is not None
     ]
     if not chosen:
@@ -256,7 +257,9 @@ def _three(
     """
     figure = _subplots(3, 1)
     for row, name in enumerate(names, start=1):
-        for run, (seconds, values, sigmas), colour in zip(runs, found, COLOURS, strict=False):
+        for run, (seconds, values, sigmas), colour in zip(
+            runs, found, colours(len(runs)), strict=True
+        ):
             _band(figure, seconds, values[:, row - 1], sigmas[:, row - 1], run.name, colour, row)
         figure.update_yaxes(title_text=name, row=row, col=1)
     for seconds, values in truths:
@@ -272,7 +275,7 @@ def _truths(curves: Sequence[Curves]) -> list[Truth]:
 
 def _errors(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
     figure = _subplots(2, 1)
-    for run, curve, colour in zip(runs, curves, COLOURS, strict=False):
+    for run, curve, colour in zip(runs, curves, colours(len(runs)), strict=True):
         if curve.truth is not None:
             _xy(figure, curve.truth.seconds, curve.truth.error_m, run.name, colour, 1)
             _xy(figure, curve.truth.seconds, curve.truth.error_deg, run.name, colour, 2)
@@ -289,7 +292,7 @@ def _apart(runs: Sequence[FinishedRun]) -> list[ReportSection]:
     if not any(between):
         return []
     figure = _subplots(1, 1)
-    for run, found, colour in zip(runs[1:], between, COLOURS[1:], strict=False):
+    for run, found, colour in zip(runs[1:], between, colours(len(runs))[1:], strict=True):
         if found is not None:
             rows = thinned(len(found.seconds))
             _xy(figure, found.seconds[rows], found.distance_m[rows], run.name, colour, 1)
@@ -303,7 +306,7 @@ def _integrity(runs: Sequence[FinishedRun]) -> list[ReportSection]:
     """Draw the integrity of runs that had a finding that matters."""
     chosen = [
         (run, colour)
-        for run, colour in zip(runs, COLOURS, strict=False)
+        for run, colour in zip(runs, colours(len(runs)), strict=True)
         if "integrity" in run.frames and run.frames["integrity"].any()
     ]
     if not chosen:
@@ -320,7 +323,7 @@ def _integrity(runs: Sequence[FinishedRun]) -> list[ReportSection]:
 
 def _features(runs: Sequence[FinishedRun]) -> ReportSection:
     figure = _subplots(1, 1)
-    for run, colour in zip(runs, COLOURS, strict=False):
+    for run, colour in zip(runs, colours(len(runs)), strict=True):
         for name, dash in (("selected", "dash"), ("matched", "dot"), ("used", "solid")):
             words = FEATURE_WORDS[name]
             if len(runs) == 1:
@@ -355,7 +358,7 @@ def _innovations(runs: Sequence[FinishedRun]) -> ReportSection:
     }
     figure = _subplots(len(shown), 1)
     for row, (name, title) in enumerate(shown.items(), start=1):
-        for run, colour in zip(runs, COLOURS, strict=False):
+        for run, colour in zip(runs, colours(len(runs)), strict=True):
             if name in run.frames:
                 _frame_curve(figure, run, name, run.name, colour, row)
         figure.update_yaxes(title_text=title, rangemode="tozero", row=row, col=1)
@@ -372,7 +375,7 @@ def _biases(runs: Sequence[FinishedRun]) -> list[ReportSection]:
     """Draw the biases of runs with an IMU."""
     chosen = [
         (run, c)
-        for run, c in zip(runs, COLOURS, strict=False)
+        for run, c in zip(runs, colours(len(runs)), strict=True)
         if run.metrics.get("motion") == "imu"
     ]
     if not chosen:
@@ -429,7 +432,7 @@ def _stereo(runs: Sequence[FinishedRun]) -> list[ReportSection]:
     """Draw what the stereo calibration is off by, of runs that estimated it."""
     chosen = [
         (run, c)
-        for run, c in zip(runs, COLOURS, strict=False)
+        for run, c in zip(runs, colours(len(runs)), strict=True)
         if np.isfinite(run.estimates["stereo_field"]).any()
     ]
     if not chosen:

@@ -11,7 +11,7 @@ from vio.report.compared import apart, compared_figures
 from vio.report.figures import ReportSection, sections
 from vio.report.html import document, image, table, text
 from vio.report.words import calibration_findings, summary
-from vio.runs.curves import COLOURS, curves_of
+from vio.runs.curves import colours, curves_of
 from vio.runs.files import MeshFile, RunFile
 from vio.runs.finished import FinishedRun
 
@@ -50,7 +50,7 @@ def page(runs: Sequence[FinishedRun]) -> str:
 
 def _words(runs: Sequence[FinishedRun]) -> str:
     paragraphs = []
-    for run, colour in zip(runs, [*COLOURS, *COLOURS], strict=False):
+    for run, colour in zip(runs, colours(len(runs)), strict=True):
         head = f'<h2><span class="swatch" style="background:{colour}"></span>{text(run.name)}</h2>'
         command = run.metrics.get("command")
         typed = ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -26,6 +27,11 @@ FEATURE_WORDS = {
     "matched": "with a right match",
     "used": "used",
 }
+
+
+def colours(count: int) -> list[str]:
+    """Return the colours of so many runs, the first ones again where they run out."""
+    return list(itertools.islice(itertools.cycle(COLOURS), count))
 
 
 class _CurveLimits(NamedTuple):

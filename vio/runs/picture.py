@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import itertools
 import logging
 import warnings
 from collections.abc import Callable, Mapping
@@ -22,13 +21,13 @@ from vio.files.tables import Rows
 from vio.geometry.lie import FloatArray
 from vio.records import S_PER_NS, STAGES, IntArray
 from vio.runs.curves import (
-    COLOURS,
     FEATURE_WORDS,
     SIGMAS,
     STAGE_COLOURS,
     Curves,
     DrawnRun,
     binned,
+    colours,
     draw,
     stereo_curves,
 )
@@ -415,9 +414,7 @@ def _compare_paths(axes: Any, results: Mapping[str, Evaluation], chosen: str | N
     flat = (truth - origin) @ plane.T
     axes.plot(*flat.T, color=_REFERENCE, lw=3.0, label="reference")
     ates = metres_texts(*(r.ate_m.rmse for r in results.values()))
-    for (name, r), ate, colour in zip(
-        results.items(), ates, itertools.cycle(COLOURS), strict=False
-    ):
+    for (name, r), ate, colour in zip(results.items(), ates, colours(len(results)), strict=True):
         label = f"{name}: ATE {ate}"
         axes.plot(*((r.aligned.positions - origin) @ plane.T).T, color=colour, lw=1.4, label=label)
     axes.plot(*flat[0], "o", color=_REFERENCE, ms=6, mfc="white", label="start")
@@ -439,7 +436,7 @@ def _compare_curves(
     if column == "position" and largest < _AXES.millimetres_below_m:
         factor = 1e3
         label = label.replace("(m)", "(mm)")
-    for (name, r), colour in zip(results.items(), itertools.cycle(COLOURS), strict=False):
+    for (name, r), colour in zip(results.items(), colours(len(results)), strict=True):
         curve = factor * values(r)
         panel.plot(_abscissa(name, r, over), curve, color=colour, lw=1.4)
     if column in "xyz":

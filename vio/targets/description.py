@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -476,13 +476,3 @@ class _Entries:
         return Target(
             "checkerboard", self.count("numRows"), self.count("numCols"), self.side("shapeSize")
         )
-
-
-def measured(target: Target, size_m: float) -> Target:
-    """Return a board with the side as measured on the print."""
-    return replace(target, size_m=size_m)
-
-
-def ids_of_markers(target: Target) -> IntArray:
-    """Return the numbers (M,) of a board's markers."""
-    return np.array([marker.id for marker in target.markers()], dtype=np.int64)

@@ -1,7 +1,7 @@
 """What a recording of a board still lacks, while it is made.
 
 No calibration is known yet: the tilt of the board is that of its foreshortening around its middle,
-and its direction that in which the board's scale falls.
+by square pixels, and its direction that in which the board's scale falls.
 """
 
 from __future__ import annotations

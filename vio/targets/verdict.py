@@ -279,10 +279,16 @@ def _largest_share(fit: RigFit, step: FloatArray) -> float:
 
 
 def compare_halves(found: Adjusted, seen: Sightings) -> Halves:
-    """Calibrate by every other view and return how far apart the results are."""
+    """Calibrate by every other view and return how far apart the results are.
+
+    They alternate among views that the same cameras have, so that neither half lacks a camera.
+    """
+    has_image = np.zeros((seen.views, seen.cameras), dtype=bool)
+    has_image[seen.view, seen.camera] = True
+    by_cameras = np.lexsort(has_image.T)
     fits: list[Adjusted] = []
     for part in (0, 1):
-        chosen = np.arange(part, seen.views, 2)
+        chosen = np.sort(by_cameras[part::2])
         start = replace(found.at, T_cam0_board=found.at.T_cam0_board[chosen])
         fits.append(BoardAdjustment(seen.of_views(chosen)).solve(start))
     one = fits[0].at

@@ -360,12 +360,12 @@ def _rectified_shift(left: CameraInfo, right: CameraInfo) -> FloatArray:
     if (fault := vertical_fault(shift)) is not None:
         raise CalibrationError(f"{right.where}: {fault}")
     if not shift[0] < 0:
-        raise CalibrationError(f"{right.where}: {_no_baseline(left, right, float(-shift[0]))}")
+        raise CalibrationError(f"{right.where}: {_no_baseline(right, float(-shift[0]))}")
     return shift
 
 
-def _no_baseline(left: CameraInfo, right: CameraInfo, baseline: float) -> str:
-    """Return why a pair of CameraInfos has no positive baseline, and what to do."""
+def _no_baseline(right: CameraInfo, baseline: float) -> str:
+    """Return why a pair has no positive baseline by its right CameraInfo, and what to do."""
     stated = float(right.P[0, 3])
     if baseline != 0.0:
         return (
