@@ -100,6 +100,11 @@ CODES: dict[str, Code] = {
         "bands of brightness move through the images; they are taken out",
         "use steady light",
     ),
+    "exposures-mixed": Code(
+        "degraded",
+        "images show the frame before as well, as filtered or blended over time",
+        "switch off temporal noise reduction and blending",
+    ),
     "projected-dots": Code(
         "degraded",
         "dots of a projector are taken out",
