@@ -84,7 +84,7 @@ STEPS_PX = np.random.default_rng(3).integers(6, 14, 60).tolist()
 def test_the_frame_before_is_found_in_images(mix: Mix, lost: tuple[int, ...]) -> None:
     begun = _found(mix, STEPS_PX, lost)[0]
     assert begun.code == "exposures-mixed"
-    assert begun.first_frame in (SINCE, SINCE + 1)
+    assert begun.first_frame in (SINCE - 1, SINCE)  # from where the motion is in doubt
     assert begun.frame is not None
     assert begun.frame <= SINCE + 4
     assert begun.figures["share"] == pytest.approx(0.4, abs=0.12)

@@ -36,7 +36,7 @@ class _MixedRules(NamedTuple):
     sigmas: float = 3.0  # that the share is beyond what it may be by chance
     most_features: Capacity[int] = 50
     # Share of the frame before in an image, which it has at least.
-    share: float = 0.06
+    share: float = 0.08
     frames: int = 6  # the newest that tell, of which …
     mixed: int = 2  # … so many have it before it is reported
     clear_frames: int = 20  # in a row that do not, before it is over
@@ -48,7 +48,7 @@ _CODE = "exposures-mixed"
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    index: int
+    before: int  # number of the frame before
     share: float  # of the frame before in its image
     least: float  # what that is at least
 
@@ -84,7 +84,7 @@ class MixedExposures:
         found = _share_of_before(list(self._seen), list(self._images))
         if found is None:
             return []
-        self._frames.append(_Frame(seen.frame_index, *found))
+        self._frames.append(_Frame(self._seen[-2].frame_index, *found))
         return self._judged(seen.frame_index)
 
     def _judged(self, index: int) -> list[Finding]:
@@ -108,12 +108,11 @@ class MixedExposures:
         # where both have the same contrast, either motion may be taken for that of the rig
         doubted = min(share / max(1.0 - share, share), 1.0)
         figures = {"share": share, "doubted_share": doubted}
-        return [Finding(_CODE, message, index, mixed[0].index, lasts=True, figures=figures)]
+        # the motion into the first such frame is in doubt already
+        return [Finding(_CODE, message, index, mixed[0].before, lasts=True, figures=figures)]
 
 
-def _share_of_before(
-    seen: list[Observations], images: list[Image]
-) -> tuple[float, float] | None:
+def _share_of_before(seen: list[Observations], images: list[Image]) -> tuple[float, float] | None:
     """The share of the frame before in an image, beyond that of the one before it, and what it is at
     least; None: too few features tell.
 
