@@ -30,15 +30,18 @@ def _exposures(steps_px: list[int]) -> Exposures:
     return [TEXTURE[:, at : at + WIDTH] for at in np.cumsum(steps_px).tolist()]
 
 
-def _found(mix: Mix, steps_px: list[int], lost: tuple[int, ...] = ()) -> list[Finding]:
-    """Findings of frames of which some lose all features."""
+def _found(
+    mix: Mix, steps_px: list[int], lost: tuple[int, ...] = (), repeated: tuple[int, ...] = ()
+) -> list[Finding]:
+    """Findings of frames of which some lose all features, or have the image of the one before."""
     exposures = _exposures(steps_px)
     rng = np.random.default_rng(2)
     check = MixedExposures()
     found: list[Finding] = []
     for k, at in enumerate(np.cumsum(steps_px).tolist()):
         image = mix(exposures, k) + rng.normal(0.0, 2.0, (HEIGHT, WIDTH))
-        shown: Image = np.asarray(np.clip(np.rint(image), 0, 255), dtype=np.uint8)
+        if k not in repeated:
+            shown: Image = np.asarray(np.clip(np.rint(image), 0, 255), dtype=np.uint8)
         place = CORNERS.reshape(-1, 2) - [at, 0]
         ids = np.flatnonzero((place[:, 0] >= 0) & (place[:, 0] < WIDTH))
         z = place[ids][:, [0, 1, 0, 1]]
@@ -118,6 +121,11 @@ def _fence(exposures: Exposures, k: int) -> FloatArray:
 )
 def test_one_exposure_is_no_finding(mix: Mix, steps_px: list[int]) -> None:
     assert not _found(mix, steps_px)
+
+
+def test_an_image_that_is_that_of_the_frame_before_is_no_finding() -> None:
+    """A left camera that is frozen, while the right images are followed."""
+    assert not _found(_clean, STEPS_PX, repeated=(15, 20, 21, 22, 23, 30, 35, 40))
 
 
 def test_a_repeated_pattern_is_no_finding() -> None:
