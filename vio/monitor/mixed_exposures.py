@@ -28,7 +28,6 @@ class _MixedRules(NamedTuple):
 
     radius_px: Capacity[int] = 8  # of the patches
     step_px: Capacity[int] = 2  # to each side, of the differences that are compared
-    compared_px: Capacity[int] = 8  # every eighth column is compared for equality
     # by less, what a feature has left and what has come there are too alike
     min_moved_px: float = 5.0
     min_gradient: float = 6.0  # gray levels, root mean square of a patch's differences
@@ -38,6 +37,7 @@ class _MixedRules(NamedTuple):
     most_features: Capacity[int] = 50
     # Share of the frame before in an image, which it has at least.
     share: float = 0.08
+    most_share: float = 0.9  # more, and it is the frame before itself, which others name
     frames: int = 6  # the newest that tell, of which …
     mixed: int = 2  # … so many have it before it is reported
     clear_frames: int = 20  # in a row that do not, before it is over
@@ -78,14 +78,12 @@ class MixedExposures:
             self._seen.clear()
             if image is None:
                 return []
-        # equal to the last bit, it is that of the frame before, and named elsewhere
-        is_repeated = bool(self._images) and _are_equal(self._images[-1], image)
         self._images.append(image)
         self._seen.append(seen)
-        if len(self._images) < 3 or is_repeated:
+        if len(self._images) < 3:
             return []
         found = _share_of_before(list(self._seen), list(self._images))
-        if found is None:
+        if found is None or found[0] > _MIXED.most_share:
             return []
         self._frames.append(_Frame(self._seen[-2].frame_index, *found))
         return self._judged(seen.frame_index)
@@ -170,12 +168,6 @@ def _places(
     far = np.hypot(moved[:, 0], moved[:, 1]) >= _MIXED.min_moved_px
     at = before.z[far, :2]
     return np.rint(at).astype(np.int64), np.rint(at - moved[far]).astype(np.int64)
-
-
-def _are_equal(before: Image, image: Image) -> bool:
-    """Whether two images are equal to the last bit, by some of their columns."""
-    step = _MIXED.compared_px
-    return np.array_equal(before[:, ::step], image[:, ::step])
 
 
 def _differences(image: Image, place: IntArray) -> FloatArray:
