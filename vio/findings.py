@@ -100,6 +100,11 @@ CODES: dict[str, Code] = {
         "bands of brightness move through the images; they are taken out",
         "use steady light",
     ),
+    "exposures-mixed": Code(
+        "degraded",
+        "images show the frame before, too",
+        "switch off temporal filters",
+    ),
     "projected-dots": Code(
         "degraded",
         "dots of a projector are taken out",
@@ -206,7 +211,7 @@ CODES: dict[str, Code] = {
     "frames-repeated": Code("degraded", "frames or rows show an earlier exposure again", _CAMERA),
     "images-held": Code(
         "unusable",
-        "equal images were taken for a rig at standstill, and were an earlier exposure again",
+        "equal images were an earlier exposure again, not a rig at standstill",
         _CAMERA,
     ),
     "depths-repeated": Code("nominal", "depth images repeat an earlier one", _CAMERA),
@@ -290,7 +295,7 @@ CODES: dict[str, Code] = {
         "see the message",
     ),
     "imu-clock": Code(
-        "degraded", "the clocks of camera and IMU are apart", "use one clock, or calibrate"
+        "degraded", "clocks of camera and IMU are apart", "use one clock, or calibrate"
     ),
     "imu-units": Code("degraded", "readings of the IMU have another unit", "see the message"),
     "imu-axes": Code(

@@ -1,7 +1,6 @@
 """A camera of the pair that is frozen, dark or covered, by the images themselves.
 
-A right image that stays the same while the left one changes is frozen; so is a left image that
-stays the same while the right one changes.
+An image that stays the same, up to noise, while the other camera's changes is frozen.
 """
 
 from __future__ import annotations
@@ -101,15 +100,19 @@ class FrozenCamera(ImageCheck):
         if np.array_equal(now.left, last.left) and not np.array_equal(now.right, last.right):
             self._count_left(last.index, index)
             return True
-        self._end_left(index)
-        if (
+        is_dark = (
             mean_and_contrast(now.right, 1)[1]
             < _FROZEN.dark_share * mean_and_contrast(now.left, 1)[1]
-        ):
-            self._distrust("right-image-dark", last.index, index)
-            return False
+        )
         change_left = image_change(now.left, last.left)
         change_right = image_change(now.right, last.right)
+        if not is_dark and _is_frozen(change_left * self._ratio, change_right):
+            self._count_left(last.index, index)
+            return True
+        self._end_left(index)
+        if is_dark:
+            self._distrust("right-image-dark", last.index, index)
+            return False
         if _is_frozen(change_right / self._ratio, change_left):
             self._distrust("right-image-frozen", last.index, index)
             return False

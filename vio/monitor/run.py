@@ -23,6 +23,7 @@ from vio.monitor.health import is_corrected
 from vio.monitor.imu_faults import ImuFaultReport, ImuSilence
 from vio.monitor.integrity import OF_THE_STATE, IntegrityMonitor, Mark
 from vio.monitor.lens_distortion import lens_check
+from vio.monitor.mixed_exposures import MixedExposures
 from vio.monitor.still_features import StillFeatures
 from vio.monitor.update_checks import UpdateChecks, UpdatedFrame
 from vio.records import (
@@ -72,6 +73,7 @@ class RunMonitor:
         self._of_updates = set[int]()  # places of their findings among all
         self._lasting = set[str]()  # codes of those that have not ended
         self._still = StillFeatures()
+        self._mixed = MixedExposures()
         self._image: Image | None = None  # left one of the present frame
         self._seen: Observations | None = None  # of the present frame
         self._baseline_fault = camera.baseline_fault
@@ -199,6 +201,7 @@ class RunMonitor:
             self._add(self._silence.frame(seen.frame_index, seen.time_ns))
         if self._repeated:
             return
+        self._add(self._mixed.frame(seen, self._image))
         distorted = None if self._lenses is None else self._lenses.frame(seen)
         if distorted is not None:
             self._add([distorted])

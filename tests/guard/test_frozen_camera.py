@@ -1,0 +1,54 @@
+"""A left image that is that of the frame before, up to noise, while the right one is new."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from vio.guard.frozen_image import FrozenCamera
+from vio.records import Image
+
+HEIGHT = 120
+WIDTH = 240
+STEP_PX = 6
+_NOISE = np.random.default_rng(1).normal(0.0, 1.0, (HEIGHT, 6 * WIDTH)).astype(np.float32)
+_BLURRED = np.asarray(cv2.GaussianBlur(_NOISE, (0, 0), 3.0), dtype=np.float64)
+TEXTURE = 120.0 + 40.0 * _BLURRED / _BLURRED.std()
+
+
+def _image(at_px: int, rng: np.random.Generator, noise: float = 1.0) -> Image:
+    noisy = TEXTURE[:, at_px : at_px + WIDTH] + rng.normal(0.0, noise, (HEIGHT, WIDTH))
+    return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
+
+
+def _frozen_frames(left_px: list[int], right_px: list[int]) -> list[int]:
+    """Frames whose left image counts as frozen, of views that begin at some columns."""
+    rng = np.random.default_rng(2)
+    check = FrozenCamera()
+    return [
+        k
+        for k, (left, right) in enumerate(zip(left_px, right_px, strict=True))
+        if check.left_is_frozen(k, _image(left, rng), _image(right + 10, rng))
+    ]
+
+
+def test_single_left_images_that_are_repeated_with_new_noise_are_not_used() -> None:
+    moving = list(range(0, 40 * STEP_PX, STEP_PX))
+    repeated = moving.copy()
+    for k in (10, 17, 18, 30):
+        repeated[k] = repeated[k - 1]
+    assert _frozen_frames(repeated, moving) == [10, 17, 18, 30]
+
+
+@pytest.mark.parametrize("step_px", [0, 1, STEP_PX])
+def test_cameras_that_see_the_same_motion_are_used(step_px: int) -> None:
+    moving = [step_px * k for k in range(40)]
+    assert not _frozen_frames(moving, moving)
+
+
+def test_a_repeated_right_image_does_not_freeze_the_left_one() -> None:
+    moving = list(range(0, 40 * STEP_PX, STEP_PX))
+    repeated = moving.copy()
+    repeated[20] = repeated[19]
+    assert not _frozen_frames(moving, repeated)
