@@ -191,7 +191,8 @@ def _jump_is_held(step_s: float, last_step_s: float = 0.1) -> bool:
 
 
 def _inputs() -> Inputs:
-    return Inputs("mono", (None,), "imu", 0, None, lambda line: None)
+    camera = StereoCamera(8.0, 8.0, 4.0, 4.0, 0.1, kind="mono")
+    return Inputs(camera, (None,), "imu", 0, None, lambda line: None)
 
 
 def _frames_taken(step_ns: float, frames: int = 20) -> int:
