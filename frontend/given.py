@@ -10,10 +10,11 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-from vio.errors import ConfigError
+from vio.errors import ConfigError, DataError
 from vio.frontend.settings import FrontendSettings
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import Detector, Frontend
+from vio.records import FrontendOutput, Observations, StereoFrame
 
 
 def as_frontend(
@@ -96,6 +97,30 @@ def build_given(
     raise ConfigError(
         f"{name}{signature} is called with the camera alone; give the others defaults"
     )
+
+
+def checked_output(frontend: Frontend, output: object, frame: StereoFrame) -> FrontendOutput:
+    """Return what a front end returned for a frame, where it is an output of that frame.
+
+    Raises:
+        DataError: it is something else.
+    """
+    name = f"{type(frontend).__name__}.process()"
+    if not isinstance(output, FrontendOutput):
+        raise DataError(
+            f"{name} returned a {type(output).__name__}; it returns a FrontendOutput(observations)"
+        )
+    found = output.observations
+    if not isinstance(found, Observations):
+        raise DataError(
+            f"{name} returned a FrontendOutput whose observations are a {type(found).__name__}; "
+            "make them with vio.records.observations(frame.index, frame.time_ns, ids, z)"
+        )
+    if (found.frame_index, found.time_ns) != (frame.index, frame.time_ns):
+        raise DataError(
+            f"{name} returned observations of frame {found.frame_index} for frame {frame.index}"
+        )
+    return output
 
 
 def load_given(text: str, camera: StereoCamera, settings: FrontendSettings) -> Frontend:

@@ -19,11 +19,10 @@ from typing import Literal
 
 import numpy as np
 
-from vio.errors import DataError
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray
 from vio.protocols import Detector, Frontend
-from vio.records import FrontendOutput, Observations, StereoFrame, shared_rows
+from vio.records import Observations, StereoFrame, shared_rows
 from vio.sim.render import View, correspondence, inside_image
 from vio.sim.scenarios import Scenario, conditions_of, plan
 from vio.sim.sequence import SimulatedRecording, Simulation, views
@@ -122,22 +121,9 @@ def check_frontend(
 
 def _process(frontend: Frontend, frame: StereoFrame) -> Observations:
     """Return the fresh observations of a frame."""
-    name = f"{type(frontend).__name__}.process()"
-    output = frontend.process(frame)
-    if not isinstance(output, FrontendOutput):
-        raise DataError(
-            f"{name} returned a {type(output).__name__}; it returns a FrontendOutput(observations)"
-        )
-    found = output.observations
-    if not isinstance(found, Observations):
-        raise DataError(
-            f"{name} returned a FrontendOutput whose observations are a {type(found).__name__}; "
-            "make them with vio.records.observations(frame.index, frame.time_ns, ids, z)"
-        )
-    if (found.frame_index, found.time_ns) != (frame.index, frame.time_ns):
-        raise DataError(
-            f"observations of frame {found.frame_index} were returned for frame {frame.index}"
-        )
+    from vio.frontend.given import checked_output
+
+    found = checked_output(frontend, frontend.process(frame), frame).observations
     return found.take(~found.stale)
 
 

@@ -89,6 +89,13 @@ def _other_rows(arrays: Arrays) -> Arrays:
     return {**arrays, "z": z}
 
 
+def _sixteenths(arrays: Arrays) -> Arrays:
+    """Disparities as OpenCV's block matchers compute them: 16 times as large, whole numbers."""
+    z = arrays["z"].copy()
+    z[:, 2] = z[:, 0] - np.rint(16 * (z[:, 0] - z[:, 2]))
+    return {**arrays, "z": z}
+
+
 CENTRE = np.array([610.0, 180, 610, 180])
 REFUSED: dict[str, tuple[Change, str]] = {
     "u and v": (_columns(1, 0, 3, 2), "in the order vl ul vr ur"),
@@ -100,6 +107,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
         "or u counts from the right edge",
     ),
     "a disparity": (_column(2, lambda z: z[:, 0] - z[:, 2]), "a disparity; write ur = ul - dis"),
+    "sixteenths": (_sixteenths, "sixteenths of a pixel, .*divide these by 16"),
     "an image of both": (_column(2, lambda z: z[:, 2] + 1200), "subtract the width of one"),
     "no right rows": (_column(3, lambda z: 0 * z[:, 3]), "vr is 0 in all .* rows"),
     "right in another order": (_other_rows, "rows vl and vr of one id differ by .* another order"),
@@ -310,3 +318,68 @@ def test_says_what_an_array_must_be(changes: Arrays, words: str, tmp_path: Path)
         arrays["ids"] = np.full(len(arrays["z"]), 5)
     with pytest.raises(DataError, match=words):
         open_dataset(make_npz(tmp_path / "features.npz", arrays))
+
+
+def test_disparities_at_the_end_of_a_search_are_not_measured(tmp_path: Path) -> None:
+    arrays = _features()
+    z = arrays["z"].copy()
+    near = arrays["has_right"] & (z[:, 0] - z[:, 2] > 32)
+    z[near, 2] = z[near, 0] - 32
+    recording = open_dataset(make_npz(tmp_path / "capped.npz", {**arrays, "z": z}))
+    (note,) = recording.recording.notes
+    assert f"at the largest disparity, 32 px, in {near.sum()} rows" in note
+    seen = [recording.observations(k) for k in range(6)]
+    kept = np.concatenate([o.has_right for o in seen])
+    np.testing.assert_array_equal(kept, arrays["has_right"] & ~near)
+
+
+def test_most_disparities_at_the_end_of_a_search_are_doubted(tmp_path: Path) -> None:
+    arrays = _features()
+    z = arrays["z"].copy()
+    near = arrays["has_right"] & (z[:, 0] - z[:, 2] > 7)
+    assert near.sum() > 0.5 * arrays["has_right"].sum()
+    z[near, 2] = z[near, 0] - 7
+    recording = open_dataset(make_npz(tmp_path / "capped.npz", {**arrays, "z": z})).recording
+    (note,) = recording.notes
+    assert "of the disparities are 7 px, the largest: if a matcher searches no farther" in note
+
+
+def test_a_plane_that_is_seen_without_noise_keeps_its_right_pixels(tmp_path: Path) -> None:
+    arrays = _features()
+    z = arrays["z"].copy()
+    z[:, 2] = z[:, 0] - 35.25
+    recording = open_dataset(make_npz(tmp_path / "plane.npz", {**arrays, "z": z}))
+    assert recording.recording.notes == ()
+    assert recording.observations(0).has_right.sum() > 100
+
+
+def _given_live(odometry: vio.Odometry, arrays: Arrays) -> int:
+    """Give frames until one is refused, and return how many were taken."""
+    for k, (a, b) in enumerate(zip(arrays["offsets"], arrays["offsets"][1:], strict=False)):
+        frame = arrays["ids"][a:b], arrays["z"][a:b], arrays["has_right"][a:b]
+        try:
+            odometry.add_observations(10**8 * k, *frame)
+        except DataError:
+            return k
+    return len(arrays["offsets"]) - 1
+
+
+@pytest.mark.parametrize("name", sorted({*REFUSED} - {"no left pixel", "order of intrinsics"}))
+def test_live_features_are_examined_as_those_of_files(name: str) -> None:
+    change, words = REFUSED[name]
+    arrays = change(_features(frames=12))
+    odometry = vio.Odometry(CAMERA, vio.load_config(overrides=["motion=none"]))
+    taken = _given_live(odometry, arrays)
+    assert taken in (2, 9)
+    rows = slice(*arrays["offsets"][taken : taken + 2])
+    frame = arrays["ids"][rows], arrays["z"][rows], arrays["has_right"][rows]
+    with pytest.raises(DataError, match=f"first {taken + 1} frames: .*{words}"):
+        odometry.add_observations(10**8 * taken, *frame)
+
+
+def test_healthy_live_features_are_taken() -> None:
+    odometry = vio.Odometry(CAMERA, vio.load_config(overrides=["motion=none"]))
+    assert _given_live(odometry, _features(frames=14)) == 14
+    estimate = odometry.estimate
+    assert estimate is not None
+    np.testing.assert_allclose(estimate.T_world_imu[:3, 3], [0, 0, 13], atol=0.1)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import scipy.io
 import yaml
-from scipy.io import savemat
+from scipy.io import loadmat, savemat
 
 import vio
 from tests import calibration_forms as forms
@@ -488,6 +488,38 @@ def test_objects_of_matlab_are_named(tmp_path: Path) -> None:
         )
         with pytest.raises(DataError, match=r"toStruct\(stereoParams\)"):
             vio.load_rig(file)
+
+
+def test_an_object_of_matlab_among_other_variables_is_named(tmp_path: Path) -> None:
+    savemat(tmp_path / "stereo.mat", {"squareSize": 25.0, "a": np.eye(3)})
+    held = [("squareSize", (1, 1), "double"), ("a", (3, 3), "double"), ("None", (1, 1), "opaque")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scipy.io.whosmat", lambda _: held)
+        with pytest.raises(CalibrationError, match=r"toStruct\(stereoParams\)"):
+            vio.load_rig(tmp_path / "stereo.mat")
+
+
+@pytest.mark.parametrize("names", [("results",), ("results", "calibration", "stereoParams")])
+def test_structures_of_matlab_may_lie_within_others(names: tuple[str, ...], tmp_path: Path) -> None:
+    expected = vio.load_rig(forms.matlab(tmp_path))
+    entries = loadmat(tmp_path / "stereo.mat", simplify_cells=True)["s"]
+    for name in names:
+        entries = {name: entries, "date": "today"}
+    savemat(tmp_path / "stereo.mat", {"workspace": entries})
+    rig = vio.load_rig(tmp_path / "stereo.mat")
+    np.testing.assert_array_equal(rig.T_cam1_cam0, expected.T_cam1_cam0)
+    assert rig.cam0 == expected.cam0
+
+
+def test_opencvs_matrices_may_be_in_a_file_of_matlab(tmp_path: Path) -> None:
+    """R and T are also names of Bouguet's toolbox."""
+    K = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
+    T = np.array([[-0.11], [0.0], [0.0]])
+    entries = {"K1": K, "K2": K, "D1": np.zeros(5), "D2": np.zeros(5), "R": np.eye(3), "T": T}
+    savemat(tmp_path / "stereo.mat", entries)
+    rig = vio.load_rig(tmp_path / "stereo.mat", image_size=SIZE)
+    assert rig.T_cam1_cam0 is not None
+    assert rig.T_cam1_cam0[0, 3] == pytest.approx(-0.11)
 
 
 def _message(camera: int, old: bool) -> str:

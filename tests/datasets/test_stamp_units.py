@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from vio.errors import DataError
+from vio.geometry.stereo import StereoCamera
 from vio.live.inputs import Inputs
 
 IMAGE = np.zeros((8, 8), dtype=np.uint8)
 
 
 def _inputs() -> Inputs:
-    return Inputs("stereo", (None, None), "imu", 0, None, lambda line: None)
+    camera = StereoCamera(8.0, 8.0, 4.0, 4.0, 0.1)
+    return Inputs(camera, (None, None), "imu", 0, None, lambda line: None)
 
 
 @pytest.mark.parametrize("step", [1, 50, 50_000])  # numbers, ms and us of a camera of 20 Hz

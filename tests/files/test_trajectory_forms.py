@@ -251,7 +251,7 @@ REFUSED = {
         "time,wx,wy,wz,ax,ay,az,temp\n1,0,0,0,9,1,2,3\n",
         r"its header \(time, wx, wy, wz, …\) names no pose: give a table of poses",
     ),
-    "no times": ("1 2 3 0 0 0 1\n", "a position and a quaternion lack the time in front"),
+    "no norm": ("1 2 3 0 0 1 1\n", "a quaternion without a time has the norm 1"),
     "angles without a header": ("1,2,3,4,5,6,7\n", "give the first four columns alone"),
 }
 
@@ -732,11 +732,80 @@ def test_times_under_the_name_of_a_frame_are_times(name: str, tmp_path: Path) ->
     assert set(np.diff(read.times_ns)) == {10**9}
 
 
-def test_a_header_without_times_is_refused(tmp_path: Path) -> None:
-    x = [str(3.0 + 2 * k) for k in range(COUNT)]
-    file = _write(tmp_path / "a.csv", "x,y,z,qx,qy,qz,qw", x, [P[:, 1:], *XYZW[1:]], ",")
-    with pytest.raises(DataError, match="names no column of times"):
+def test_poses_without_times_are_those_of_frames(tmp_path: Path) -> None:
+    x = [repr(float(p)) for p in P[:, 0]]
+    forms = {
+        "a.csv": ("x,y,z,qx,qy,qz,qw", XYZW[1:], ","),
+        "pose_left.txt": ("", XYZW[1:], " "),
+        "b.csv": ("", WXYZ[1:], ","),
+    }
+    for name, (header, columns, separator) in forms.items():
+        read = read_trajectory(_write(tmp_path / name, header, x, [P[:, 1:], *columns], separator))
+        assert (read.times_ns, read.frame_indices, read.body) == (None, None, "cam0")
+        np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+def test_the_state_of_openvins_is_read(tmp_path: Path) -> None:
+    header = (
+        "# timestamp(s) q p v bg ba cam_imu_dt num_cam cam0_k cam0_d cam0_rot cam0_trans ... "
+        "imu_model dw da tg wtoI atoI etc"
+    )
+    state = np.zeros((COUNT, 35))
+    file = _write(tmp_path / "state_estimate.txt", header, SECONDS, [Q, P, ZERO[:, :3], state])
+    read = read_trajectory(file)
+    np.testing.assert_array_equal(read.times_ns, TIMES_NS)
+    np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body, atol=1e-12)
+    assert (read.body, read.orientations) == ("imu", "stated")
+
+
+def test_standard_deviations_of_openvins_are_no_poses(tmp_path: Path) -> None:
+    header = (
+        "# timestamp(s) q p v bg ba cam_imu_dt num_cam cam0_k cam0_d cam0_rot cam0_trans .... etc"
+    )
+    file = _write(tmp_path / "deviation.txt", header, SECONDS, [np.full((COUNT, 30), 0.01)])
+    with pytest.raises(DataError, match=r"the quaternion has norm 0\.02, not 1"):
         read_trajectory(file)
+
+
+def _matrix_text(T: FloatArray) -> str:
+    return "".join(" ".join(map(repr, row)) + "\n" for row in T.tolist())
+
+
+@pytest.mark.parametrize("above", ["", "{k} {k} {k}\n"])
+def test_matrices_may_go_over_four_lines(above: str, tmp_path: Path) -> None:
+    text = "".join(above.format(k=k) + _matrix_text(T) for k, T in enumerate(TRUTH.T_world_body))
+    (tmp_path / "poses.log").write_text(text)
+    read = read_trajectory(tmp_path / "poses.log")
+    assert (read.times_ns, read.body) == (None, "cam0")
+    np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["{}.txt", "frame-{:06d}.pose.txt", "{:04d}_pose.csv"])
+def test_matrices_may_be_in_a_file_each(name: str, tmp_path: Path) -> None:
+    for k, T in enumerate(TRUTH.T_world_body):
+        lost = k == 7  # as ScanNet writes it
+        (tmp_path / name.format(k)).write_text(
+            _matrix_text(np.full((4, 4), -np.inf) if lost else T)
+        )
+    read = read_trajectory(tmp_path)
+    kept = np.delete(np.arange(COUNT), 7)
+    np.testing.assert_array_equal(read.frame_indices, kept)
+    np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body[kept], atol=1e-12)
+
+
+def test_files_of_single_matrices_may_be_named_by_times(tmp_path: Path) -> None:
+    for t, T in zip(NS, TRUTH.T_world_body, strict=True):
+        (tmp_path / f"{t}.txt").write_text(_matrix_text(T))
+    np.testing.assert_array_equal(read_trajectory(tmp_path).times_ns, TIMES_NS)
+
+
+def test_files_that_are_no_single_matrix_are_named(tmp_path: Path) -> None:
+    (tmp_path / "0.txt").write_text("1 2 3\n")
+    with pytest.raises(DataError, match=r"0.txt: holds 3 numbers, not the 16"):
+        read_trajectory(tmp_path)
+    (tmp_path / "0.txt").write_text("car 1 2 3\n")
+    with pytest.raises(DataError, match=r"0.txt: could not convert .*'car'"):
+        read_trajectory(tmp_path)
 
 
 @pytest.mark.parametrize("separator", [";", "\t", " "])

@@ -4,11 +4,14 @@ give.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.plain_maker import make_plain
 from vio import Odometry, Parts, evaluate, load_config, open_dataset, run
 from vio.cli import main
 from vio.errors import ConfigError, DataError
@@ -21,8 +24,9 @@ from vio.frontend.patches import half_image
 from vio.frontend.settings import GridSettings
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.guard.guarded import guarded
 from vio.protocols import Detector, Frontend
-from vio.records import FrontendOutput, Image, StereoFrame, observations
+from vio.records import FrontendOutput, Image, Observations, StereoFrame, observations
 from vio.testing import check_frontend
 
 CAMERA = StereoCamera(fu=300.0, fv=300.0, cu=160.0, cv=100.0, baseline_m=0.1)
@@ -178,7 +182,7 @@ def test_observations_of_another_kind_are_named() -> None:
 
     with pytest.raises(DataError, match=r"observations are a list; make them with"):
         check_frontend(Loose, frames=2)
-    with pytest.raises(DataError, match="frame 1 were returned for frame 0"):
+    with pytest.raises(DataError, match="returned observations of frame 1 for frame 0"):
         check_frontend(OfAnother, frames=2)
 
 
@@ -254,3 +258,36 @@ def test_a_detector_runs_live(flight: Path) -> None:
             assert estimate is not None
             poses.append(estimate.T_world_imu)
     np.testing.assert_array_equal(poses, wanted.estimates.column("T_world_imu"))
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (lambda seen: None, "returned a NoneType; it returns a FrontendOutput"),
+        (lambda seen: seen, "returned a Observations; it returns a FrontendOutput"),
+        (lambda seen: (seen.ids, seen.z), "returned a tuple; it returns a FrontendOutput"),
+        (lambda seen: FrontendOutput(seen.z), "whose observations are a ndarray; make them with"),
+        (
+            lambda seen: FrontendOutput(replace(seen, frame_index=seen.frame_index + 1)),
+            "returned observations of frame 1 for frame 0",
+        ),
+    ],
+)
+def test_a_run_says_what_a_front_end_must_return(
+    returned: Callable[[Observations], FrontendOutput], message: str
+) -> None:
+    class Own:
+        def process(self, frame: StereoFrame, prior: object = None) -> FrontendOutput:
+            return returned(observations(frame.index, frame.time_ns, [1], [[9.0, 9, 8, 9]]))
+
+    guard = guarded(Own(), CAMERA)
+    with pytest.raises(DataError, match=rf"Own.process\(\) .*{message}"):
+        guard.process(StereoFrame(0, 0, IMAGE, IMAGE))
+
+
+def test_a_file_without_a_class_is_told_the_form(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = str(make_plain(tmp_path / "plain"))
+    assert main(["run", recording, "--frontend", "own.py", "--out", str(tmp_path / "out")]) == 1
+    assert "--frontend own.py: give FILE.py:CLASS" in capsys.readouterr().err

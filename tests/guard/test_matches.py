@@ -582,3 +582,35 @@ def test_matches_are_back_from_half_of_the_usual_share_on(share: float, is_back:
 def test_where_few_features_match_anyway_none_are_lost(usual: float, is_lost: bool) -> None:
     found = _matches_found([usual] * 5 + [0.0] * 5)
     assert found == (["right-matches-lost"] if is_lost else [])
+
+
+def _straight_drive() -> list[Observations]:
+    """A drive straight ahead: rows of near points move more from frame to frame."""
+    rng = np.random.default_rng(5)
+    points = rng.uniform([-15.0, -4.0, 5.0], [15.0, 2.0, 80.0], (900, 3))
+    frames = []
+    for k in range(FRAMES):
+        depth = np.maximum(points[:, 2] - 1.0 * k, 0.1)
+        left = points[:, :2] / depth[:, None] * 500.0 + [320.0, 240.0]
+        right = left - np.column_stack([150.0 / depth, np.zeros(len(depth))])
+        z = np.hstack([left, right]) + rng.normal(0.0, 0.2, (len(depth), 4))
+        inside = (z > 0).all(axis=1) & (z < [640, 480, 640, 480]).all(axis=1) & (depth > 3)
+        ids = np.flatnonzero(inside)
+        frames.append(observations(k, k * STEP_NS, ids, z[ids]))
+    return frames
+
+
+@pytest.mark.parametrize("delay", [-1, 1])
+def test_pairs_a_frame_apart_on_a_straight_drive_are_found(delay: int) -> None:
+    seen = _straight_drive()
+    # the left pixels of each frame with the right ones of `delay` frames before
+    apart = [
+        with_right_of(seen[k], seen[k - delay]) for k in range(FRAMES) if 0 <= k - delay < FRAMES
+    ]
+    (found,) = [f for f in inspected(apart)[1] if f.code == "pairs-shifted"]
+    assert found.figures["delay_frames"] == delay
+    assert found.first_frame <= 12
+
+
+def test_pairs_of_a_straight_drive_are_not_apart() -> None:
+    assert codes(inspected(_straight_drive())[1]) == []

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import vio
+from tests.plain_maker import make_plain
 from vio.config import Config
 from vio.errors import ConfigError
 from vio.records import Trajectory
@@ -23,6 +24,13 @@ RIG = vio.Rig.rectified(300.0, 300.0, 159.5, 119.5, 0.1, 320, 240)
 def test_a_rig_is_no_path(live: Any, given: object) -> None:
     with pytest.raises(TypeError, match=r"give what vio.load_rig\(path\) returns"):
         live(given)
+
+
+def test_a_recording_is_no_rig(tmp_path: Path) -> None:
+    recording: Any = vio.open_dataset(make_plain(tmp_path / "plain"))
+    for given in (recording, recording.recording):
+        with pytest.raises(TypeError, match=r"rig: give what vio.load_rig\(path\) returns, not"):
+            vio.Odometry(given)
 
 
 @pytest.mark.parametrize("live", [vio.Odometry, vio.LiveOdometry])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from vio.datasets.frame_times import pair_stamps
-from vio.errors import DataError, VioError
+from vio.errors import NOTE, DataError, VioError
 from vio.geometry.lie import FloatArray, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.live import map_service
@@ -191,7 +191,8 @@ def _jump_is_held(step_s: float, last_step_s: float = 0.1) -> bool:
 
 
 def _inputs() -> Inputs:
-    return Inputs("mono", (None,), "imu", 0, None, lambda line: None)
+    camera = StereoCamera(8.0, 8.0, 4.0, 4.0, 0.1, kind="mono")
+    return Inputs(camera, (None,), "imu", 0, None, lambda line: None)
 
 
 def _frames_taken(step_ns: float, frames: int = 20) -> int:
@@ -423,6 +424,15 @@ def _waits_for_others(seconds: float) -> bool:
         transport.spin = clock.sleep
         _wait_for_subscribers(transport, ["left", "right"], lambda: None, lambda: False)
         return clock.now_s - 1000.0 > seconds
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_playing_says_that_it_waits(waits: bool, caplog: pytest.LogCaptureFixture) -> None:
+    transport = MagicMock()
+    transport.subscribers = lambda topic: not waits
+    with caplog.at_level(NOTE):
+        _wait_for_subscribers(transport, ["left"], lambda: None, iter([False, True]).__next__)
+    assert ("waiting for a subscriber to left; --now" in caplog.text) == waits
 
 
 def _is_silent(seconds: float) -> bool:

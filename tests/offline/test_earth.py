@@ -20,8 +20,9 @@ from tests.mapping.test_map_store import CAMERA, _features, _row
 from vio.cli import main
 from vio.datasets.gnss import read_gnss
 from vio.datasets.gnss_fixes import SIGMA_M, GnssFixes, checked_fixes
-from vio.earth.alignment import Georeference, _between, _Problem, georeference, heading_deg
+from vio.earth.alignment import Georeference, _Problem, georeference, heading_deg, places_between
 from vio.earth.alignment import Path as GraphPath
+from vio.earth.clock import clock_doubt
 from vio.earth.exports import write_utm
 from vio.earth.geodesy import LocalFrame, ecef, geodetic_of, utm, utm_zone
 from vio.errors import DataError, EstimationError
@@ -202,7 +203,7 @@ def test_covariance_of_the_rigid_transform_covers_it() -> None:
 def test_normal_matrix_is_the_jacobian_of_the_gradient_without_residuals() -> None:
     drive = _drive(seed=3, poses=24)
     path = replace(drive.path, first=np.array([1]), second=np.array([20]))
-    before, share, _ = _between(path, drive.fixes.times_ns)
+    before, share, _ = places_between(path, drive.fixes.times_ns)
     C, has_height = drive.fixes.covariance, drive.fixes.has_height
     nowhere = np.zeros((len(C), 3))
     measured = _Problem(path, before, share, nowhere, C, has_height, LEVER_M).antenna(
@@ -572,3 +573,34 @@ def test_a_path_across_the_equator_is_in_one_zone(tmp_path: Path) -> None:
     write_utm(tmp_path / "x.csv", np.array([[1e-4, 11.0, 0.0], [-1e-4, 11.0, 0.0]]))
     northings = np.loadtxt(tmp_path / "x.csv", delimiter=",", skiprows=2)[:, 1]
     assert abs(northings[0] - northings[1]) < 30
+
+
+def _precise(drive: Drive) -> GnssFixes:
+    """Positions of the drive's antenna to 2 cm."""
+    before, share, _ = places_between(drive.path, drive.fixes.times_ns)
+    p = drive.T_enu[:, :3, 3] + drive.T_enu[:, :3, :3] @ LEVER_M
+    p = (1 - share)[:, None] * p[before] + share[:, None] * p[before + 1]
+    p += np.random.default_rng(9).normal(0, 0.02, p.shape)
+    geodetic = LocalFrame(ORIGIN).geodetic(p)
+    return replace(drive.fixes, geodetic=geodetic, covariance=1e-4 * drive.fixes.covariance)
+
+
+@pytest.mark.parametrize("late_s", [-0.5, 0.0, 0.5])
+def test_another_clock_of_a_precise_receiver_is_named(late_s: float) -> None:
+    drive = _drive(seed=43)
+    fixes = _precise(drive)
+    fixes = replace(fixes, times_ns=fixes.times_ns + round(1e9 * late_s))
+    said = clock_doubt(drive.path, fixes, LEVER_M, 0)
+    if late_s == 0.0:
+        assert said is None
+    else:
+        assert said is not None
+        assert f"give --time-offset={-late_s:.2f}" in said
+        assert clock_doubt(drive.path, fixes, LEVER_M, round(-1e9 * late_s)) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("jumps", [(), ((30, 50, (57.0, 0.0, 0.0)), (60, 80, (25.0, 0.0, 0.0)))])
+def test_errors_of_positions_are_no_other_clock(seed: int, jumps: Sequence[Jump]) -> None:
+    drive = _drive(seed=seed, jumps=jumps)
+    assert clock_doubt(drive.path, drive.fixes, LEVER_M, 0) is None

@@ -329,6 +329,8 @@ def _read(path: Path, compared_with: Path | None = None) -> tuple[Trajectory, Fl
     Raises:
         DataError: it cannot be read, or a recording is compared with a run, not the run with it.
     """
+    from vio.files.pose_matrices import are_matrix_files
+    from vio.files.trajectories import read_trajectory
     from vio.runs.files import RunFile
     from vio.runs.stated import read_run
 
@@ -339,6 +341,8 @@ def _read(path: Path, compared_with: Path | None = None) -> tuple[Trajectory, Fl
         quiet()
         if model_folder(path) is not None:
             return read_colmap_trajectory(path), None
+        if are_matrix_files(path):
+            return read_trajectory(path), None
         truth = _truth_of(path)
         if compared_with is not None and (compared_with / RunFile.METRICS).is_file():
             raise DataError(

@@ -110,7 +110,8 @@ def execute(args: argparse.Namespace) -> int:
 
     shown = Shown(not args.quiet, args.view, finished)
     own = None
-    if args.frontend is not None and ":" in args.frontend:  # no name of a setting
+    # no name of a setting
+    if args.frontend is not None and (":" in args.frontend or args.frontend.endswith(".py")):
         own = args.frontend
         args.frontend = None
     if args.resume is not None:

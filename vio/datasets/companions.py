@@ -17,6 +17,7 @@ from vio.dataclass import dataclass
 from vio.datasets import rigs
 from vio.datasets.common import naming
 from vio.datasets.image_pairs import ImageSize
+from vio.datasets.json_lines import read_imu_lines
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.rigs.eth3d import EXTRINSICS, FOLDERS, is_eth3d, truth_of_left
 from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transform
@@ -49,6 +50,10 @@ from vio.records import (
 
 IMU_FILES = (
     "imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv", "gyro_accel.csv",
+)  # fmt: skip
+# of data sets and SDKs, read where the pose of the IMU is known
+_LOGGED_IMU_FILES = (
+    "sensor_data/xsens_imu.csv", "xsens_imu.csv", "ms25.csv", "imu.jsonl", "data.jsonl",
 )  # fmt: skip
 # of a gyro and an accelerometer that have a file each
 _GYRO_FILES = ("gyro.csv", "gyro.txt", "gyr.csv", "gyr.txt", "gyroscope.csv", "gyroscope.txt")
@@ -280,9 +285,9 @@ def _read_motion(
     imu = imu_files(layout.root, layout.base)
     velocity = layout.root / "velocity.csv"
     files = [*imu, *([velocity] if velocity.is_file() else [])]
-    others = [] if imu else _other_imu_notes(layout)
     if not files:
-        return in_time_order(), [], others
+        return _read_logged(layout, rig, times_ns, timed)
+    others = [] if imu else _other_imu_notes(layout)
     if not timed:
         raise DataError(
             f"{files[0]}: needs the times of the images on the same clock; add times.txt, or "
@@ -306,6 +311,31 @@ def _read_motion(
         check_overlap(times_ns, speeds.times_ns, velocity)
         parts.append(speeds)
     return in_time_order(*parts), files, notes
+
+
+def _read_logged(
+    layout: Layout, rig: Rig, times_ns: IntArray, timed: bool
+) -> tuple[MotionSamples[MotionSample], list[Path], list[str]]:
+    """Read the IMU of a data set or an SDK, as `_read_motion`; where that is not possible, the images
+    are used alone, with a note.
+    """
+    file = _first_file((layout.root, layout.base), _LOGGED_IMU_FILES)
+    if file is None:
+        return in_time_order(), [], _other_imu_notes(layout)
+    if rig.T_cam0_imu is None or not timed:
+        lacks = (
+            "the images have no times"
+            if rig.T_cam0_imu is not None
+            else "the pose of its sensor is not known; add T_cam0_imu.txt (IMU to left camera)"
+        )
+        return in_time_order(), [], [f"{file}: not read, as {lacks}"]
+    notes: list[str] = []
+    try:
+        record, notes_read = _read_imu((file,), notes)
+        samples, notes_moved = imu_on_camera_clock(record, rig, times_ns, file)
+    except DataError as error:
+        return in_time_order(), [], [f"not read: {error}"]
+    return in_time_order(samples), [file], [*notes, *notes_read, *notes_moved]
 
 
 def imu_files(*folders: Path) -> tuple[Path, ...]:
@@ -346,6 +376,8 @@ def _read_imu(files: Sequence[Path], notes: list[str]) -> tuple[ImuRecord, Seque
         DataError: as `read_imu_table`, or no reading of the gyro lies between two of the
             accelerometer.
     """
+    if files[0].suffix.lower() == ".jsonl":
+        return read_imu_lines(files[0])
     if len(files) == 1:
         return read_imu_table(files[0], cut=notes)
     gyro, accel = files

@@ -17,7 +17,7 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import DOUBT, FeatureTracks, shared_rows
+from vio.records import DOUBT, BoolArray, FeatureTracks, shared_rows
 
 
 class _Rules(NamedTuple):
@@ -25,7 +25,8 @@ class _Rules(NamedTuple):
 
     fewest: int = 20  # rows that tell
     most: float = 0.8  # share of rows that are "most"
-    few: float = 0.1  # share of rows that may lie outside of the image
+    few: float = 0.1  # share of rows that may lie outside of the image …
+    very_few: float = 0.01  # … where disparities are whole numbers, as a matcher computes them
     near_px: float = 2.0  # rows of left and right that agree; how far outside of an image is in it
     unrelated: float = 0.5  # correlation below which left and right pixels are not of one point
     normalised_max: float = 10.0  # no image has all its pixels nearer to its corner …
@@ -36,6 +37,12 @@ class _Rules(NamedTuple):
     beyond: float = 3.0  # times the principal point, where no image of one size ends
     parts: int = 32  # of a pixel, in which pixels may be measured
     filled: float = 0.8  # share of the upper left quarter that features of half the size reach
+    steps: float = 16.0  # of a pixel, in which matchers write disparities as whole numbers
+    same_px: float = 1e-3  # disparities that are one number, but for rounding
+    least_capped: int = 20  # rows that share the largest disparity …
+    capped: float = 0.01  # … a share of all …
+    of_a_plane: float = 0.5  # share above which they may be those of one plane, without noise
+    crowded: float = 3.0  # … times the rows within a pixel below it
 
 
 _RULES = _Rules()
@@ -56,7 +63,8 @@ def without_placeholders(tracks: FeatureTracks) -> tuple[FeatureTracks, str | No
 
     These are pixels that are no numbers, pairs at or below zero that several rows share to the
     last bit, as -1 -1, and the left pixel itself, to the last bit, in several rows: not where it is
-    a whole one, or a part of it, and so is the right one of a far point.
+    a whole one, or a part of it, and so is the right one of a far point. Where a matcher searches no
+    farther than a whole number of pixels, and gives what is nearer that disparity, these are none.
     """
     right = tracks.z[:, 2:]
     empty = np.isnan(right).any(axis=1)
@@ -68,17 +76,40 @@ def without_placeholders(tracks: FeatureTracks) -> tuple[FeatureTracks, str | No
     parts = tracks.z[:, :2] * _RULES.parts
     own &= (parts != np.rint(parts)).any(axis=1)
     own &= own.sum() > 1
-    held = tracks.has_right & (empty | shared | own)
+    capped, largest, share = _capped(tracks)
+    capped &= share <= _RULES.of_a_plane
+    held = tracks.has_right & (empty | shared | own | capped)
     if not held.any():
         return tracks, None
     kinds = ["no numbers"] if (tracks.has_right & empty).any() else []
     kinds += ["ul vl"] if own.any() else []
     kinds += [f"{u:g} {v:g}" for u, v in values[counts > 1].tolist()]
+    if capped.any():
+        kinds.insert(0, f"at the largest disparity, {largest:g} px,")
     note = (
         f"ur vr are {' or '.join(kinds[:3])} in {int(held.sum())} rows that has_right marks as "
         "measured; these are taken as seen by the left camera alone"
     )
     return replace(tracks, has_right=tracks.has_right & ~held), note
+
+
+def _capped(tracks: FeatureTracks) -> tuple[BoolArray, float, float]:
+    """Return which rows (R,) have the largest disparity of all, a whole number of pixels, where it is
+    that of many more than are just below it; that disparity, px, and their share.
+    """
+    disparity = tracks.z[:, 0] - tracks.z[:, 2]
+    known = disparity[tracks.has_right & np.isfinite(disparity)]
+    none = np.zeros(len(disparity), dtype=np.bool_)
+    if len(known) < _RULES.least_capped:
+        return none, 0.0, 0.0
+    top = float(np.rint(known.max()))
+    at_top = int((np.abs(known - top) <= _RULES.same_px).sum())
+    below = int(((known < top - _RULES.same_px) & (known > top - 1 - _RULES.same_px)).sum())
+    share = at_top / len(known)
+    is_cap = at_top >= _RULES.least_capped and share >= _RULES.capped
+    if not is_cap or top < known.max() - _RULES.same_px or at_top < _RULES.crowded * below:
+        return none, 0.0, 0.0
+    return np.abs(disparity - top) <= _RULES.same_px, top, share
 
 
 def features_fault(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
@@ -102,15 +133,23 @@ def features_fault(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
         _of_units,
         _of_columns,
         _of_places,
+        _of_right_places,
         _of_ids,
     )
     return next((fault for check in checks if (fault := check(camera, tracks)) is not None), None)
 
 
 def features_doubt(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
-    """Return a note where pixels and principal point look like those of images of two sizes:
-    features go far beyond an image of no stated size.
+    """Return a note where pixels and principal point look like those of images of two sizes
+    (features go far beyond an image of no stated size), or most disparities like those at the end of a
+    matcher's search.
     """
+    capped, largest, share = _capped(tracks)
+    if capped.any() and share > _RULES.of_a_plane:
+        return (
+            f"{DOUBT}{100 * share:.0f} % of the disparities are {largest:g} px, the largest: if a matcher "
+            "searches no farther, mark these as not found"
+        )
     if len(tracks.ids) < _RULES.fewest or camera.projection != "pinhole":
         return None
     half = _half_size(camera)
@@ -259,6 +298,26 @@ def _of_places(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
         f"(u {low[0]:.0f} to {high[0]:.0f}, v {low[1]:.0f} to {high[1]:.0f}): they are those of images "
         "of another size, or u and v are exchanged; intrinsics, image_size and pixels must be of one "
         "image"
+    )
+
+
+def _of_right_places(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
+    """Whether right pixels lie left of the image, where no camera measures any."""
+    z = tracks.z[tracks.has_right]
+    if camera.kind != "stereo" or len(z) < _RULES.fewest:
+        return None
+    outside = float(np.mean(z[:, 2] < -_RULES.near_px))
+    disparity = z[:, 0] - z[:, 2]
+    is_whole = bool((np.abs(disparity - np.rint(disparity)) <= _RULES.same_px).all())
+    if outside <= (_RULES.very_few if is_whole else _RULES.few):
+        return None
+    inside = float(np.mean(z[:, 0] - disparity / _RULES.steps >= -_RULES.near_px))
+    where = f"{100 * outside:.0f} % of the right pixels lie left of the image (ur from {z[:, 2].min():.0f})"
+    if inside < 1 - _RULES.few:
+        return f"{where}; write ur vr in pixels of the right image, and mark those not found"
+    return (
+        f"{where}: disparities are in sixteenths of a pixel, as OpenCV's StereoBM and StereoSGBM "
+        "compute them; divide these by 16 before ur = ul - disparity"
     )
 
 

@@ -430,7 +430,8 @@ def _frame_counts(files: Sequence[Path]) -> IntArray:
 
 def _file_of_times(layout: Layout) -> Path | None:
     """Return the list of times beside the images; None: there is none."""
-    folders = dict.fromkeys((layout.base, layout.root, layout.left, layout.left.parent))
+    beside = (layout.left, layout.left.parent, *layout.above(layout.left))
+    folders = dict.fromkeys((layout.base, layout.root, *beside))
     named = (folder / name for folder in folders for name in TIME_LISTS)
     return next((file for file in named if file.is_file()), None)
 

@@ -14,7 +14,18 @@ from vio.errors import DataError
 from vio.files.inputs import check_regular
 
 SUFFIX = ".mat"
+HELD_OBJECT = (
+    "holds an object of MATLAB's, which nothing else reads; save its numbers: "
+    "s = toStruct(stereoParams); save('stereo.mat', 's', '-v7')"
+)
 _OBJECTS = ("opaque", "object")  # classes of what only MATLAB itself can read
+
+
+def holds_object(path: Path) -> bool:
+    """Return whether a MATLAB file that can be read holds an object, maybe beside other variables."""
+    from scipy.io import whosmat
+
+    return any(kind in _OBJECTS for _, _, kind in whosmat(path))
 
 
 def read_variables(
@@ -49,10 +60,7 @@ def read_variables(
             raise IsADirectoryError(errno.EISDIR, "it is a folder")
         held = whosmat(path)
         if held and all(kind in _OBJECTS or name.startswith("__") for name, _, kind in held):
-            raise DataError(
-                f"{path}: holds an object of MATLAB's, which nothing else reads; save its numbers: "
-                "s = toStruct(stereoParams); save('stereo.mat', 's', '-v7')"
-            )
+            raise DataError(f"{path}: {HELD_OBJECT}")
         shapes = {name: shape for name, shape, _ in held}
         names = [name for name in shapes if wanted(name)]
         check_array_bytes({name: 8 * math.prod(shapes[name]) for name in names}, path)

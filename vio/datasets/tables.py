@@ -69,6 +69,23 @@ _INDEXED_AXIS = re.compile(r"[\[(]([012xyz])[\])]")
 _IMU_COLUMNS = 7
 _SENSOR_COLUMNS = 4  # of a gyro or an accelerometer alone
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
+# columns of `sensor_msgs/Imu` in the order of its fields
+_MESSAGE = (
+    *("sec", "nanosec", "frame_id", "qx", "qy", "qz", "qw"),
+    *(f"q_cov_{k}" for k in range(9)),
+    *("wx", "wy", "wz"),
+    *(f"w_cov_{k}" for k in range(9)),
+    *("ax", "ay", "az"),
+    *(f"a_cov_{k}" for k in range(9)),
+)
+# of data sets, whose tables have no header, by the names of their files: KAIST Urban's, NCLT's
+_KNOWN = {
+    "xsens_imu.csv": (
+        *("timestamp [ns]", "qx", "qy", "qz", "qw", "euler_x", "euler_y", "euler_z"),
+        *("wx", "wy", "wz", "ax", "ay", "az", "mx", "my", "mz"),
+    ),
+    "ms25.csv": ("timestamp [us]", "mx", "my", "mz", "ax", "ay", "az", "wx", "wy", "wz"),
+}
 # Of times that two lines share: at most so many, and the unit in which all steps are whole numbers is
 # at most so much of the usual one, or the times were rounded
 _MAX_SHARED = 0.35
@@ -540,7 +557,10 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
     count = _columns(path)
     if count <= _IMU_COLUMNS:
         return read_table(path, _IMU_COLUMNS, _IMU_FORM, cut)
-    table = _of_one_unit(_time_first(read_table(path, count, _IMU_FORM, cut)), cut)
+    table = read_table(path, count, _IMU_FORM, cut)
+    if not table.header:
+        table = replace(table, header=_known_header(table))
+    table = _of_one_unit(_time_first(table), cut)
     order = _imu_order(table) if table.header else None
     if order is None:
         raise DataError(
@@ -548,6 +568,26 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
             "columns in a header, or write these seven"
         )
     return _columns_of(table, order)
+
+
+def _known_header(table: NumberTable) -> tuple[str, ...]:
+    """Return the names of the columns of a table without a header: of messages `sensor_msgs/Imu` as
+    `ros2 topic echo --csv` writes them, which begin with seconds, nanoseconds and the name of a frame,
+    or of a data set's, by the name of its file; empty: not known.
+    """
+    count = 1 + table.values.shape[1]
+    name = table.path.name.lower()
+    if name in _KNOWN and count == len(_KNOWN[name]):
+        return _KNOWN[name]
+    nanoseconds = table.values[:, 0]
+    is_message = (
+        count == len(_MESSAGE)
+        and all(stamp.isdecimal() for stamp in table.stamps)
+        and (np.isfinite(nanoseconds) & (nanoseconds == np.rint(nanoseconds))).all()
+        and ((nanoseconds >= 0) & (nanoseconds < NS_PER_S)).all()
+        and np.isnan(table.values[:, 1]).all()
+    )
+    return _MESSAGE if is_message else ()
 
 
 def _of_one_unit(table: NumberTable, notes: list[str] | None) -> NumberTable:
@@ -804,6 +844,12 @@ def _sensor_and_axis(cell: str) -> tuple[str, str]:
         return _sensor(letters), dict(zip("012", "xyz", strict=True)).get(indexed[1], indexed[1])
     axis = next((c for c in reversed(of_axis) if c in "xyz"), "")
     return _sensor(letters), axis
+
+
+def sensor_of(name: str) -> str:
+    """Return w for the name of a gyro's readings, a for an accelerometer's, else nothing."""
+    letters = re.sub(r"[^a-z]", "", name.lower())
+    return "" if _NO_READING.search(letters) else _sensor(letters)
 
 
 def _sensor(letters: str) -> str:

@@ -34,6 +34,10 @@ class Layout:
     left: Path  # folder of the images, or video
     right: Path
 
+    def above(self, side: Path) -> tuple[Path, ...]:
+        """Return the folders between that of a camera's images and the root, from below."""
+        return tuple(folder for folder in side.parents if self.root in folder.parents)
+
 
 def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
     """Return a note that names what lies in the folder and was not read, and one for photometric
@@ -75,7 +79,7 @@ def _files_named_in(path: Path) -> list[str]:
 def _not_read(layout: Layout, kept: set[Path]) -> list[str]:
     """Return the names of what else lies in the folders of a recording."""
     images = [side for side in (layout.left, layout.right) if side.is_dir()]
-    within = (layout.base, *images, *(side.parent for side in images))
+    within = (layout.base, *images, *(folder for side in images for folder in layout.above(side)))
     folders = [layout.root, *(f for f in within if layout.root in f.parents)]
     found = []
     for folder in dict.fromkeys(folders):

@@ -125,7 +125,7 @@ def georeference(
         EstimationError: fewer than three positions are within the trajectory's time, or they
             determine nothing.
     """
-    before, share, inside = _between(path, fixes.times_ns + time_offset_ns)
+    before, share, inside = places_between(path, fixes.times_ns + time_offset_ns)
     if int(inside.sum()) < _ALIGNMENT.min_fixes:
         own_ns = fixes.times_ns + time_offset_ns
         spans = [_span_text(times_ns) for times_ns in (own_ns, path.times_ns)]
@@ -221,7 +221,7 @@ def _span_text(times_ns: IntArray) -> str:
     return f"{begin_s:.3f} to {end_s:.3f} s"
 
 
-def _between(path: Path, times_ns: IntArray) -> tuple[IntArray, FloatArray, BoolArray]:
+def places_between(path: Path, times_ns: IntArray) -> tuple[IntArray, FloatArray, BoolArray]:
     """Return the pose before each time (N,), its share of the way to the next one, and whether
     it is between two.
     """

@@ -76,6 +76,10 @@ _OF_FRAMES = re.compile(r"([tpq][xyzw])_[a-z]+_[a-z]+")
 # whole seconds of a stamp, and the rest of it in the next column, as header.stamp.sec has them
 _SECONDS = re.compile(r"(.*?)(?:secs?|seconds?)")
 _NANOSECONDS = re.compile(r"(.*?)(?:n|nano)(?:secs?|seconds?)")
+# the groups of OpenVINS's state: the quaternion, JPL's from the world to the IMU, is Hamilton's from
+# the IMU to the world in numbers
+_STATE = re.compile(r"timestamp\(s\) q p v bg ba\b")
+_STATE_COLUMNS = 17  # of the time and these
 _SPELT = re.compile(r"\b(?:w[ ,]*x[ ,]*y[ ,]*z|x[ ,]*y[ ,]*z[ ,]*w)\b", re.IGNORECASE)
 _WORDS = re.compile(r"[A-Za-z_][A-Za-z_0-9.]*")
 
@@ -128,6 +132,8 @@ def named_columns(headers: Sequence[str], count: int, *, w_first: bool) -> PoseC
     Raises:
         DataError: a header states motions between two times, or units of length that are not read.
     """
+    if count >= _STATE_COLUMNS and any(_STATE.match(text) for text in headers):
+        return PoseColumns(0, (5, 6, 7), (1, 2, 3, 4), "stated", "s", names_stamp=True)
     columns = (
         _named_columns(cells, w_first=w_first) for cells in reversed(_cells_of(headers, count))
     )

@@ -23,6 +23,7 @@ from vio.files.atomic import atomic_write_text
 from vio.files.dates import are_whole_dates, dates_in_names, undated
 from vio.files.messages import joined_stamps
 from vio.files.pose_columns import PoseColumns, are_geographic, named_columns, pose_columns
+from vio.files.pose_matrices import joined_matrices, matrices_of_files
 from vio.files.stamps import POSE_PACE, parse_stamps
 from vio.files.text import exact_text, lines_of, seconds_text, whole_ns_stamps
 from vio.files.units import header_cells, split_cells, with_decimal_points
@@ -131,9 +132,10 @@ def read_trajectory(
 ) -> Trajectory:
     """Read a trajectory; the format is detected from the content unless given.
 
-    A KITTI file describes cam0 and has no times; KITTI-360's have the number of the frame (or a time)
-    before 12 numbers of the IMU's pose, or 16 of cam0's; an EuRoC file describes the IMU; a TUM file
-    describes the frame of its comment `# body: imu` or `# body: cam0`, else the IMU. `body`
+    A KITTI file describes cam0 and has no times, as do TartanAir's (a position and a quaternion a row),
+    and matrices over four lines or in a file each, numbered in its name; KITTI-360's have the number of
+    the frame (or a time) before 12 numbers of the IMU's pose, or 16 of cam0's; an EuRoC file describes
+    the IMU; a TUM file describes the frame of its comment `# body: imu` or `# body: cam0`, else the IMU. `body`
     overrides all of these. A header may name the columns, in any order and among others, and the
     unit of the stamps. Where it does not, a quaternion has w first between commas and last between
     white space, which `Trajectory.orientations` says; quaternions of zeros, and files with four
@@ -149,11 +151,13 @@ def read_trajectory(
             f"{', '.join(get_args(TrajectoryFormat))}"
         )
     if Path(path).is_dir():
-        raise DataError(f"{path}: is a folder; give one file of all poses, a line each")
+        return _of_files(Path(path), body)
     table = _read_table(Path(path))
     if not table.rows:
         raise DataError(f"{table.path}: holds no poses; give a TUM, KITTI or EuRoC trajectory file")
     named = _named(table)
+    if fmt is None and (untimed := _untimed_columns(table, named)) is not None:
+        return _untimed(table, untimed, body)
     kind = fmt or _detect(table, named)
     _check_columns(table, kind, None if fmt is not None else named)
     if kind == "kitti":
@@ -173,6 +177,48 @@ def read_trajectory(
         poses, times_ns, _body(table, header_body, body) or _DEFAULT_BODY[kind], numbers
     )
     return _with_orientations(table, trajectory, orientations, columns.orientations)
+
+
+def _of_files(folder: Path, body: BodyFrame | None) -> Trajectory:
+    """Return the poses of a folder of files with one matrix each; the numbers in their names are those
+    of frames, or times.
+    """
+    rows, names = matrices_of_files(folder)
+    table = _Table(folder, [], rows, list(range(1, len(rows) + 1)), None)
+    trajectory = Trajectory(_kitti_poses(table, 0), None, body or _DEFAULT_BODY["kitti"])
+    if all(name.isdecimal() and int(name) < _POSES.max_frame_number for name in names):
+        return replace(trajectory, frame_indices=np.array([int(k) for k in names], dtype=np.int64))
+    return replace(trajectory, times_ns=parse_stamps(names, table.where, None, pace=POSE_PACE))
+
+
+def _untimed_columns(table: _Table, named: PoseColumns | None) -> PoseColumns | None:
+    """Return the columns of a position and a quaternion that have no time, by their header, or by the
+    norm of the quaternions where there are seven columns; None: there is a time, or no such pose.
+    """
+    if named is not None:
+        of_pose = (*named.position, *(named.quaternion or ()))
+        return named if not named.names_stamp and named.stamp in of_pose else None
+    count = _POSE_COLUMNS - 1
+    if any(len(table.fields(row)) != count for row in range(len(table.rows))):
+        return None
+    columns = pose_columns([], _POSE_COLUMNS, w_first=table.commas)
+    assert columns.quaternion is not None
+    x, y, z, w = (column - 1 for column in columns.quaternion)
+    norm = np.linalg.norm(_floats(table, (x, y, z, w), finite=False), axis=1)
+    if not (np.abs(norm - 1) <= _POSES.rounded_norm).all():
+        return None
+    return replace(columns, position=(0, 1, 2), quaternion=(x, y, z, w))
+
+
+def _untimed(table: _Table, columns: PoseColumns, body: BodyFrame | None) -> Trajectory:
+    """Return poses without times, one of cam0 for each frame, as TartanAir has them."""
+    for note in columns.notes:
+        logger.warning("%s: %s", table.path, note)
+    poses, known = _quaternion_poses(table, columns, "tum")
+    trajectory = Trajectory(poses, None, body or _DEFAULT_BODY["kitti"])
+    if not known.all():  # those that stay keep their numbers
+        trajectory = trajectory.numbered()
+    return _with_orientations(table, trajectory, known, columns.orientations)
 
 
 def _named(table: _Table) -> PoseColumns | None:
@@ -195,11 +241,6 @@ def _named(table: _Table) -> PoseColumns | None:
         )
     if named is None or _are_of_matrices(table, named):
         return None
-    if not named.names_stamp and named.stamp in (*named.position, *(named.quaternion or ())):
-        raise DataError(
-            f"{table.path}: its header names no column of times, and begins with those of the pose; write "
-            "the time of each pose in front"
-        )
     return named
 
 
@@ -503,6 +544,10 @@ def _read_table(path: Path) -> _Table:
         elif line:
             rows.append(undated(line.rstrip(",;").rstrip()))
             line_numbers.append(number)
+    joined = joined_matrices(rows)
+    if joined is not None:
+        rows, firsts = joined
+        line_numbers = [line_numbers[first] for first in firsts]
     rows, named = joined_stamps(_without_suffixes(rows, path), path, stated=bool(comments))
     comments += named
     first = rows[0] if rows else ""
@@ -619,8 +664,8 @@ def _without_times(count: int) -> str:
     if count != _POSE_COLUMNS - 1:
         return ""
     return (
-        "; a position and a quaternion lack the time in front, and angles in place of a quaternion are "
-        "not read: give the first four columns alone"
+        "; angles in place of a quaternion are not read: give the first four columns alone, and a quaternion "
+        "without a time has the norm 1"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from vio.findings import Finding
+from vio.frontend.given import checked_output
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.bands import BandRemoval
@@ -97,7 +98,7 @@ class GuardedFrontend:
         """
         images = images_of(frame, pair=self._pair)
         if images is None:
-            output = self.frontend.process(frame, prior)
+            output = checked_output(self.frontend, self.frontend.process(frame, prior), frame)
             return self._checked(output, (), prior, right_usable=True)
         images = self._inspect(images)
         output = self._output(images, prior)
@@ -155,7 +156,9 @@ class GuardedFrontend:
         if images.skipped:
             return no_features(images.frame)
         if images.left_usable:
-            return self.frontend.process(images.checked(), prior)
+            checked = images.checked()
+            output = self.frontend.process(checked, prior)
+            return checked_output(self.frontend, output, images.frame)
         if isinstance(self.frontend, FollowsRight):
             return self.frontend.follow_right(images.checked(), prior)
         return no_features(images.frame)

@@ -8,6 +8,7 @@ import numpy as np
 
 from vio.findings import Finding
 from vio.frontend.right_delay import RightDelay
+from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.match_check import MatchCheck, SharedMatches, without_right
 from vio.records import Observations
@@ -20,12 +21,15 @@ class LateMatches(MatchCheck):
     """Takes the delay of the right camera out of its pixels, at first order.
 
     A recording of features whose right pixels are a whole frame late or early from the start is
-    paired anew instead, by the finding `pairs-shifted`.
+    paired anew instead, by the finding `pairs-shifted`. The rows of late ones differ by the motion in
+    the last frame, those of early ones by that in the next: the two are learned apart, as points that
+    come near move more from frame to frame.
     """
 
     def __init__(self, camera: StereoCamera) -> None:
         super().__init__()
         self._delay = RightDelay(camera, keeps_images=False)
+        self._early = RightDelay(camera, keeps_images=False)  # by the motion in the next frame
         self._frames = 0
 
     def inspect(self, seen: Observations, shared: SharedMatches) -> Observations:
@@ -36,6 +40,7 @@ class LateMatches(MatchCheck):
         rows = shared.now[:, 3] - shared.now[:, 1]
         self._delay.update(seen.frame_index, left, flow, rows, shared.seconds)
         self._found += [self._paired_anew(f) for f in self._delay.take_findings()]
+        self._learn_early(seen.frame_index, shared, flow)
         delay = self._delay.frames
         if delay == 0.0:
             return seen
@@ -44,6 +49,25 @@ class LateMatches(MatchCheck):
         z = seen.z.copy()
         z[shared.rows, 2:] += delay * (shared.now - shared.before)[:, 2:]
         return without_right(replace(seen, z=z), dropped)
+
+    def _learn_early(self, index: int, shared: SharedMatches, flow: FloatArray) -> None:
+        """Learn from the rows of the frame before, and take right pixels that were a whole frame early
+        as such.
+
+        Args:
+            index: frame number.
+            shared: features of this frame and the one before.
+            flow: motion (N, 2) of their left pixels from the one to the other.
+        """
+        if self._frames > _FROM_THE_START or self._delay.frames in (-1.0, 1.0):
+            return
+        before = shared.before
+        rows = before[:, 3] - before[:, 1]
+        self._early.update(index, before[:, :2], flow, rows, shared.seconds)
+        found = self._early.take_findings()
+        if found and self._early.frames == -1.0:
+            self._delay.know(-1)
+            self._found += [self._paired_anew(f) for f in found]
 
     def _paired_anew(self, found: Finding) -> Finding:
         """Return a finding as one of wrong pairs, where it is one."""

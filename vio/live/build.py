@@ -5,7 +5,6 @@ and for live use.
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
@@ -100,21 +99,22 @@ def recorded_source(dataset: Dataset, config: Config) -> Source:
 
 
 def refuse_other_types(config: Config, **given: object) -> None:
-    """Raise TypeError, with the call that makes the right one, where a program gives a path or a
-    dictionary in the place of what is read from it.
+    """Raise TypeError, with the call that makes the right one, where a program gives something else,
+    such as a path, a dictionary, or a recording in the place of its camera.
 
     Args:
         config: settings.
         given: `rig` or `dataset`.
     """
-    wanted = {"rig": "vio.load_rig(path)", "dataset": "vio.open_dataset(path)"}
-    for name, value in given.items():
-        if value is None or isinstance(value, (str, os.PathLike, dict, list, tuple, np.ndarray)):
-            raise TypeError(f"{name}: give what {wanted[name]} returns, not {type(value).__name__}")
     if not isinstance(config, Config):
         raise TypeError(
             f"config: give what vio.load_config(...) returns, not {type(config).__name__}"
         )
+    wanted = {"rig": "vio.load_rig(path)", "dataset": "vio.open_dataset(path)"}
+    needs = {"rig": ("cam0", "fu"), "dataset": ("recording",)}
+    for name, value in given.items():
+        if not any(hasattr(value, attribute) for attribute in needs[name]):
+            raise TypeError(f"{name}: give what {wanted[name]} returns, not {type(value).__name__}")
 
 
 def live_source(

@@ -129,8 +129,9 @@ class EventInputs(ABC, Generic[Result]):
             has_right: (N,) whether the feature is seen in the right image; None: all are.
 
         Raises:
-            DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not
-                after the last one.
+            DataError: shapes disagree, an id occurs twice, a pixel is not finite, a time not after
+                the last one, or the first frames show pixels or ids that are not what they must be
+                (`vio.datasets.feature_forms`).
         """
         with self._checking:
             return self.take(self.inputs.observations(t_ns, ids, z, has_right))

@@ -13,10 +13,12 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from vio.datasets.feature_forms import features_fault
 from vio.datasets.frame_times import FrameRateLimit
 from vio.errors import ConfigError, DataError, OrderError
 from vio.filters.inputs import LARGEST
 from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
 from vio.records import (
     Image,
     ImuSample,
@@ -25,6 +27,7 @@ from vio.records import (
     MotionSource,
     Observations,
     VelocitySample,
+    feature_tracks,
     observations,
 )
 
@@ -45,6 +48,9 @@ class _StampRules(NamedTuple):
 
 _STAMPS = _StampRules()
 
+
+# numbers of frames of features, from the start, after which all so far are examined together
+_EXAMINED_AFTER = (3, 10)
 
 Kind: TypeAlias = Literal["stereo", "mono", "rgbd"]
 # height and width of each camera's images; None: any
@@ -77,7 +83,7 @@ class Inputs:
 
     def __init__(
         self,
-        camera: Kind,
+        camera: StereoCamera,
         shapes: Shapes,
         motion: MotionSource | None,
         offset_ns: int,
@@ -87,14 +93,15 @@ class Inputs:
         """Begin a trajectory.
 
         Args:
-            camera: what a frame consists of.
+            camera: the rectified one; its kind says what a frame consists of.
             shapes: of the images, as they are given.
             motion: the sensor that samples may come from; None: none.
             offset_ns: subtracted from the samples' stamps, so that they are on the camera's clock.
             most_hz: frames a second that are used; None: all.
             say: takes a line about a stamp that is left out.
         """
-        self._camera = camera
+        self._rectified = camera
+        self._camera = camera.kind
         self._shapes = shapes
         self._motion = motion
         self._offset_ns = offset_ns
@@ -104,6 +111,8 @@ class Inputs:
         self._samples = _Stamps("sample", _STAMPS.min_sample_step_ns)
         self._count = 0  # of frames
         self._kind: str | None = None  # of frames: images or observations
+        # features of the first frames, until all are examined; None: they were
+        self._first_seen: list[Observations] | None = []
 
     def images(
         self,
@@ -159,16 +168,35 @@ class Inputs:
         """Return a frame of observations; None: as of `images`.
 
         Raises:
-            DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not
-                after the last one.
+            DataError: shapes disagree, an id occurs twice, a pixel is not finite, a time not after
+                the last one, or the first frames show pixels or ids that are not what they must be
+                (`vio.datasets.feature_forms`).
         """
         seen = checked_observations(self._count, t_ns, ids, z, has_right)
+        self._examine(seen)
         numbered = self._numbered(t_ns, "observations")
+        if self._first_seen is not None:
+            self._first_seen.append(seen)
+            if len(self._first_seen) == _EXAMINED_AFTER[-1]:
+                self._first_seen = None
         return (
             None
             if numbered is None
             else GivenFrame(*numbered, seen=replace(seen, time_ns=numbered[1]))
         )
+
+    def _examine(self, seen: Observations) -> None:
+        """Raise DataError where the features of the first frames, with these, are not rectified
+        pixels of points with ids.
+        """
+        if self._first_seen is None:
+            return
+        so_far = [*self._first_seen, seen]
+        if len(so_far) not in _EXAMINED_AFTER:
+            return
+        tracks = feature_tracks(dict(enumerate(so_far)), len(so_far))
+        if fault := features_fault(self._rectified, tracks):
+            raise DataError(f"features of the first {len(so_far)} frames: {fault}")
 
     def samples(
         self, source: MotionSource, t_ns: Any, first: npt.ArrayLike, second: npt.ArrayLike

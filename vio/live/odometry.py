@@ -159,7 +159,7 @@ class Odometry(EventInputs["Estimate | None"]):
         self._processor = build_processor(self._source, self._config, parts, self._map)
         self._predictor = PosePredictor(self._config.imu.gravity_mps2)
         self._inputs = Inputs(
-            self.camera.kind,
+            self.camera,
             _image_shapes(self.camera, self._rectifier),
             self.motion,
             self._offset_ns,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
@@ -13,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from vio.datasets.gnss_fixes import GnssFixes
 from vio.earth.alignment import Georeference, Path, georeference, heading_deg
+from vio.earth.clock import clock_doubt
 from vio.earth.exports import write_geojson, write_kml, write_points_geojson, write_utm
 from vio.earth.geodesy import LocalFrame
 from vio.errors import DataError
@@ -24,6 +26,8 @@ from vio.records import BoolArray, Trajectory
 from vio.runs.finished import point_positions, up_of_odometry
 from vio.runs.mapped import read_keyframes, read_loops, read_trajectories
 from vio.runs.stated import read_metrics
+
+logger = logging.getLogger(__name__)
 
 FACTS = "earth.json"
 _UP_RAD = float(np.radians(0.3))  # of an IMU's vertical; of an upright camera's
@@ -182,7 +186,12 @@ def place_on_earth(
     Raises:
         EstimationError: the positions do not determine its place.
     """
-    found = georeference(of.path, fixes, lever_arm_m, round(1e9 * time_offset_s))
+    offset_ns = round(1e9 * time_offset_s)
+    found = georeference(of.path, fixes, lever_arm_m, offset_ns)
+    doubt = clock_doubt(of.path, fixes, lever_arm_m, offset_ns)
+    if doubt is not None:
+        logger.warning("%s", doubt)
+        fixes = replace(fixes, notes=(*fixes.notes, doubt))
     epsg = _write(
         folder, of, found.frame, found.T_enu_body, found.scale, fixes.geodetic, found.used
     )

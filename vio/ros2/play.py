@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from vio.datasets.bags.topics import CAMERA_INFO, IMAGE, IMU
 from vio.datasets.bags.writer import BagWriter
+from vio.errors import NOTE
 from vio.geometry.lie import se3_inverse
 from vio.numerics.kinds import Capacity
 from vio.protocols import Dataset
@@ -16,6 +18,8 @@ from vio.records import Event, ImuSample, Recording, StereoFrame
 from vio.ros2.calibration import info_topic
 from vio.ros2.sensors import SensorTopics
 from vio.ros2.transport import Quality, Transport, publisher
+
+logger = logging.getLogger(__name__)
 
 CAMERA_FRAMES = ("cam0", "cam1")
 IMU_FRAME = "imu"
@@ -108,6 +112,8 @@ def _wait_for_subscribers(
     Meanwhile the calibration is announced: a node may need it before it subscribes to images.
     """
     others_until: float | None = None
+    if not transport.subscribers(topics[0]):
+        logger.log(NOTE, "waiting for a subscriber to %s; --now does not wait", topics[0])
     while not should_stop():
         if transport.subscribers(topics[0]):
             others_until = others_until or time.monotonic() + _OTHERS_S

@@ -22,6 +22,7 @@ from vio.datasets.kitti_raw import (
     read_imu_pose,
     read_perspective,
 )
+from vio.datasets.mat_files import HELD_OBJECT, holds_object
 from vio.datasets.rigs import (
     bare,
     basalt,
@@ -257,6 +258,8 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
         raise CalibrationError(
             f"{path}: describes {what}; give the file of the cameras, as Kalibr's camchain-….yaml"
         )
+    if suffix == matlab.SUFFIX and holds_object(path):
+        raise CalibrationError(f"{path}: {HELD_OBJECT}")
     raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
 
 

@@ -37,6 +37,7 @@ _OF_BOUGUET = (
 )
 _MAX_BYTES = 50_000_000  # with the points of all views
 _LARGEST = 100  # elements of a variable of a calibration, of which a structure is one
+_DEPTH = 5  # of structures within one another, at which cameras are looked for
 _SHORT_M = 0.005  # no stereo camera has a shorter baseline
 
 
@@ -50,9 +51,9 @@ def read_mat(path: Path) -> dict[str, object]:
         return {}
     shapes, _ = read_variables(path, lambda _: False)
     of_bouguet = "fc_left" in shapes and "fc_right" in shapes
-    others = [name for name in shapes if name not in _OF_BOUGUET]
     # structures, whatever they hold, and no arrays of a recording
-    wanted = _OF_BOUGUET if of_bouguet else [n for n in others if math.prod(shapes[n]) <= _LARGEST]
+    small = [name for name, shape in shapes.items() if math.prod(shape) <= _LARGEST]
+    wanted = _OF_BOUGUET if of_bouguet else small
     _, found = read_variables(path, wanted.__contains__, plain=True)
     entries = {name: _plain(value) for name, value in found.items()}
     return {name: value for name, value in entries.items() if value is not None}
@@ -77,9 +78,16 @@ def _is_of_bouguet(entries: Entries) -> bool:
 
 
 def _parameters(entries: Entries) -> Mapping[str, Any] | None:
-    """Return the structure of both cameras, which may be one of the entries; None: there is none."""
-    within = (value for value in entries.values() if isinstance(value, dict))
-    return next((found for found in (entries, *within) if _FIRST in found), None)
+    """Return the structure of both cameras, which may be one of the entries, or within one of them;
+    None: there is none.
+    """
+    level: list[Mapping[str, Any]] = [entries]
+    for _ in range(_DEPTH):
+        found = next((item for item in level if _FIRST in item), None)
+        if found is not None:
+            return found
+        level = [value for item in level for value in item.values() if isinstance(value, dict)]
+    return None
 
 
 def read(source: Source) -> Rig:
