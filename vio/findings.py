@@ -239,6 +239,11 @@ CODES: dict[str, Code] = {
         "no feature can be used; the pose is a prediction",
         "more light or texture, or a shorter exposure",
     ),
+    "few-features": Code(
+        "degraded",
+        "too few features tell the scene from what moves on its own",
+        "more light or texture, a wider lens, a motion sensor",
+    ),
     "features-refused": Code(
         "degraded",
         "many features contradict the others, and are refused",

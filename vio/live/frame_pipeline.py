@@ -35,6 +35,7 @@ from vio.records import (
     UpdateReport,
     no_features,
 )
+from vio.selection.selectors import KeepAll
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,7 @@ class FramePipeline:
             imu=motion == "imu",
             extrinsics_known=extrinsics_known,
             gravity_mps2=gravity_mps2,
+            selects=not isinstance(parts.selector, KeepAll),
         )
         self._shutter = parts.shutter
         self._motion = motion

@@ -65,11 +65,13 @@ class RunMonitor:
         imu: bool,
         extrinsics_known: bool = True,
         gravity_mps2: float = DEFAULT_IMU.gravity_mps2,
+        selects: bool = False,
     ) -> None:
         """Create the monitors of a rectified pair; extrinsics (4, 4), which the filter estimates if
-        they are not known; `imu`: raw samples propagate the pose.
+        they are not known; `imu`: raw samples propagate the pose; `selects`: the back end is given
+        few of the features on purpose.
         """
-        self._updates = UpdateChecks(camera, imu=imu)
+        self._updates = UpdateChecks(camera, imu=imu, selects=selects)
         self._of_updates = set[int]()  # places of their findings among all
         self._lasting = set[str]()  # codes of those that have not ended
         self._still = StillFeatures()

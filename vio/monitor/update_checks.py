@@ -8,6 +8,7 @@ from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.geometry.stereo import StereoCamera
 from vio.monitor.contradiction import ImuContradiction
+from vio.monitor.few_features import FewFeatures
 from vio.monitor.frame_order import FrameOrder
 from vio.monitor.health import RefusalReport, RunHealth
 from vio.monitor.image_geometry import ImageGeometry
@@ -29,8 +30,10 @@ class UpdatedFrame:
 class UpdateChecks:
     """Everything that is judged by updates, and begins anew where frames are estimated again."""
 
-    def __init__(self, camera: StereoCamera, *, imu: bool) -> None:
-        """Begin; `imu`: raw samples propagate the pose."""
+    def __init__(self, camera: StereoCamera, *, imu: bool, selects: bool = False) -> None:
+        """Begin; `imu`: raw samples propagate the pose; `selects`: the back end is given few of the
+        features on purpose.
+        """
         from vio.guard.two_motions import TwoMotions  # loads OpenCV
 
         self._camera = camera
@@ -42,11 +45,13 @@ class UpdateChecks:
         self._order = FrameOrder()
         self._geometry = ImageGeometry(camera)
         self._misfit = TrackMisfit()
+        self._few = None if selects else FewFeatures()
         self._motions = TwoMotions(camera)
 
     def anew(self, *, imu: bool) -> UpdateChecks:
         """Return what judges updates from the first frame on again; `imu`: it is used."""
-        fresh = UpdateChecks(self._camera, imu=self.contradiction is not None)
+        imu_read = self.contradiction is not None
+        fresh = UpdateChecks(self._camera, imu=imu_read, selects=self._few is None)
         fresh.refusals.imu = imu
         fresh.health.begin_again(self.health)
         return fresh
@@ -62,6 +67,8 @@ class UpdateChecks:
         yield from self._order.frame(index, position, ratio if measured else None)
         if self.contradiction is not None and self.refusals.imu:
             yield from self.contradiction.frame(index, ratio)
+        if self._few is not None:
+            yield from self._few.frame(index, report, measured=measured)
         seen = frame.seen
         if seen is None:
             return
