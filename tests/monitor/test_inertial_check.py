@@ -22,6 +22,7 @@ from vio.geometry.stereo import StereoCamera, project
 from vio.imu.clocks import judge_clocks
 from vio.imu.findings import InertialFinding
 from vio.monitor.inertial import InertialCheck
+from vio.monitor.motion import CameraTwists
 from vio.monitor.run import RunMonitor
 from vio.records import (
     Estimate,
@@ -96,7 +97,14 @@ def _motion(name: str, seed: int) -> MotionSpline:
 
 
 @cache
-def _recording(name: str, seed: int = 0, mount: str = "euroc") -> Watched:
+def _recording(
+    name: str,
+    seed: int = 0,
+    mount: str = "euroc",
+    *,
+    frame_ns: int = _FRAME_NS,
+    sigma_px: float = 0.5,
+) -> Watched:
     rig = euroc_rectified_rig() if mount == "euroc" else small_rig()
     motion = _motion(name, seed)
     if name == "car":
@@ -104,13 +112,12 @@ def _recording(name: str, seed: int = 0, mount: str = "euroc") -> Watched:
     if mount == "euroc":
         motion = rotate_body_axes(motion, R_FLU_EUROC_IMU)
     imu = simulate_imu(motion, noise=ImuNoise(), seed=seed)
-    times = np.arange(motion.start_ns, motion.end_ns, _FRAME_NS)
+    times = np.arange(motion.start_ns, motion.end_ns, frame_ns)
     T_cam0_imu = se3_inverse(rig.T_imu_cam0)
     camera = rectified_camera(rig)
     reach = 15.0 if name == "car" else 3.0
-    frames = _observe(
-        camera, motion_at(motion, times).T_world_imu, T_cam0_imu, times.tolist(), reach, seed
-    )
+    poses = motion_at(motion, times).T_world_imu
+    frames = _observe(camera, poses, T_cam0_imu, times.tolist(), reach, seed, sigma_px)
     gravity = 9.81 * motion_at(motion, imu.times_ns).T_world_imu[:, 2, :3]
     return Watched(camera, T_cam0_imu, list(imu_samples(imu)), list(gravity), frames)
 
@@ -190,6 +197,25 @@ def _shifted(it: Watched, seconds: float) -> list[ImuSample]:
 )
 def test_correct_recording_gives_no_finding(name: str, seed: int, mount: str) -> None:
     assert _watch(_recording(name, seed, mount)) == []
+
+
+def test_correct_recording_of_a_fast_camera_gives_no_finding() -> None:
+    """At 100 frames/s a slow turn is less than the errors of pixels from frame to frame."""
+    it = _recording("slow", 2, frame_ns=10_000_000, sigma_px=0.2)
+    assert _watch(it, frames=it.frames[:600]) == []
+
+
+@pytest.mark.parametrize(
+    ("frame_ns", "spacing"), [(10_000_000, 3), (20_000_000, 2), (33_333_333, 1)]
+)
+def test_turns_are_those_between_frames_30_ms_apart(frame_ns: int, spacing: int) -> None:
+    it = _recording("room")
+    twists = CameraTwists(it.camera)
+    seen = replace(it.frames[0], time_ns=0)
+    motions = [twists.frame(replace(seen, time_ns=k * frame_ns)) for k in range(70)]
+    found = [motion for motion in motions if motion is not None]
+    assert np.all(found[0].end_ns - found[0].begin_ns == spacing * frame_ns)
+    assert twists.spacing == spacing
 
 
 @pytest.mark.parametrize("count", [10, 25, 40, 90])

@@ -72,13 +72,16 @@ def _found(frames: Sequence[Observations]) -> list[Finding]:
     return [found for o in frames if (found := check.frame(o)) is not None]
 
 
-@pytest.mark.parametrize("k1", [-0.3, -0.1, 0.1])
+@pytest.mark.parametrize(("k1", "frame"), [(-0.3, 19), (-0.1, 39), (0.1, 39)])
 @pytest.mark.parametrize("rotation", [(0.0, 0.0, 0.0), (0.004, -0.003, 0.006)])
-def test_distortion_of_both_lenses_is_found_once(k1: float, rotation: Sequence[float]) -> None:
+def test_distortion_of_both_lenses_is_found_once(
+    k1: float, frame: int, rotation: Sequence[float]
+) -> None:
+    """Little of it only after 40 frames: the first ones are seldom known as well as they say."""
     turned = _turned(rotation)
     lens = radial(k1)
     (finding,) = _found(frames_seen(lens, lambda xy: turned(lens(xy)), 200))
-    assert (finding.code, finding.frame, finding.lasts) == ("other-calibration", 19, True)
+    assert (finding.code, finding.frame, finding.lasts) == ("other-calibration", frame, True)
     assert finding.figures["distorted_share"] * k1 > 0.0
 
 
@@ -150,7 +153,7 @@ def test_distortion_is_found_after_frames_without_matches() -> None:
     lens = radial(-0.1)
     frames = frames_seen(lens, lens)
     blind = [observations(o.frame_index, o.time_ns, [], np.zeros((0, 4))) for o in frames[:30]]
-    assert [f.frame for f in _found([*blind, *frames])] == [19]
+    assert [f.frame for f in _found([*blind, *frames])] == [39]
 
 
 def test_what_is_kept_does_not_grow() -> None:

@@ -17,14 +17,19 @@ IMAGES_ALONE = replace(Config(), motion="none")
 COUNT = 100  # features of a frame
 
 
-def _frame(k: int, first: int, count: int = COUNT) -> Observations:
+def _frame(k: int, first: int, count: int = COUNT, step_ns: int = STEP_NS) -> Observations:
     """Frame k shows the features from a number on."""
     ids = np.arange(first, first + count)
-    return observations(k, k * STEP_NS, ids, np.ones((count, 4)))
+    return observations(k, k * step_ns, ids, np.ones((count, 4)))
 
 
 def _codes(
-    firsts: list[int], ratio: float | None, *, measured: bool = False, imu: bool = False
+    firsts: list[int],
+    ratio: float | None,
+    *,
+    measured: bool = False,
+    imu: bool = False,
+    step_ns: int = STEP_NS,
 ) -> list[str]:
     """The codes of what the last of some frames shows, which brings an innovation ratio."""
     check = ViewChange()
@@ -32,7 +37,7 @@ def _codes(
     for k, first in enumerate(firsts):
         last = k == len(firsts) - 1
         given = ratio if last else 1.0
-        found = check.frame(_frame(k, first), given, measured=measured, imu=imu)
+        found = check.frame(_frame(k, first, step_ns=step_ns), given, measured=measured, imu=imu)
     return [finding.code for finding in found]
 
 
@@ -54,6 +59,15 @@ def test_a_motion_sensor_has_measured_the_motion() -> None:
     """Also where images of noise, as in the dark, seem to contradict it."""
     assert _codes([*USUAL, 130], 4.0, measured=True) == ["no-features"]
     assert _codes([*USUAL, 130], 40.0, measured=True, imu=True) == ["no-features"]
+
+
+def test_the_first_steps_of_a_fast_camera_find_the_velocity_and_leave_no_imu() -> None:
+    """Frame 6 comes after 0.12 s at 50 frames/s; 0.3 s count."""
+    assert _codes([*USUAL, 60], 15.0, measured=True, imu=True, step_ns=20_000_000) == []
+    later = [10 * k for k in range(15)]
+    assert _codes([*later, 150], 15.0, measured=True, imu=True, step_ns=20_000_000) == [
+        "imu-disagrees"
+    ]
 
 
 def test_images_that_leave_the_imu_at_once_are_named() -> None:

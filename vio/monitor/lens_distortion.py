@@ -25,8 +25,11 @@ from vio.records import IntArray, Observations
 class _LensRules(NamedTuple):
     """When pixels are distorted."""
 
-    # frames with matches, after which it is asked
-    looked_at: tuple[int, ...] = (20, 40, 80, 160)
+    # Frames with matches, after which it is asked, and the share of its distance from the principal
+    # point that counts, by which a pixel moves where that squared is half the corners'. Healthy
+    # recordings have up to 0.014, of KITTI's own rectification. The few features of the first frames,
+    # of which many are at the rims of near things, come to 0.033 ± 0.005 in healthy renders.
+    looks: tuple[tuple[int, float], ...] = ((20, 0.1), (40, 0.03), (80, 0.03), (160, 0.03))
     most: int = 20  # whose matches are kept, spread over all so far
     # of features, each of which is left out once: all matches of a feature have its error, which none
     # of them shows
@@ -35,15 +38,13 @@ class _LensRules(NamedTuple):
     sigmas: float = 6.0  # beyond which it is known
     # … where these are small: of a scene that hardly shows it, what is no noise comes to more
     max_sigma: float = 0.01
-    # Share of its distance from the principal point by which a pixel moves where that squared is half
-    # the corners'. Healthy recordings have up to .014, of KITTI's own rectification.
-    min_share: float = 0.03
     steps: Tolerance[int] = 10  # of the robust fit, and of each that leaves a block out
     further_steps: Tolerance[int] = 3
     least_px: float = 0.1  # width of a row's error, at least
 
 
 _LENS = _LensRules()
+_LAST_LOOK = _LENS.looks[-1][0]
 _CODE = "other-calibration"
 
 
@@ -70,7 +71,7 @@ class LensCheck:
     @property
     def done(self) -> bool:
         """Whether it is not asked any more."""
-        return self._frames >= _LENS.looked_at[-1]
+        return self._frames >= _LAST_LOOK
 
     def frame(self, seen: Observations) -> Finding | None:
         """Return the finding after a frame."""
@@ -82,7 +83,8 @@ class LensCheck:
         if len(self._matches) > _LENS.most:
             del self._matches[1::2]
             self._every *= 2
-        if self._frames not in _LENS.looked_at:
+        min_share = dict(_LENS.looks).get(self._frames)
+        if min_share is None:
             return None
         found = self._share()
         if self.done:
@@ -90,9 +92,9 @@ class LensCheck:
         if found is None:
             return None
         share, sigma = found
-        if abs(share) <= max(_LENS.min_share, _LENS.sigmas * sigma) or sigma > _LENS.max_sigma:
+        if abs(share) <= max(min_share, _LENS.sigmas * sigma) or sigma > _LENS.max_sigma:
             return None
-        self._frames = _LENS.looked_at[-1]
+        self._frames = _LAST_LOOK
         self._matches.clear()
         index = seen.frame_index
         message = (
