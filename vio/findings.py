@@ -122,12 +122,12 @@ CODES: dict[str, Code] = {
     ),
     "shutter-put-right": Code(
         "nominal",
-        "rows are exposed one after the other, and the run began again with that put right",
+        "rows are exposed in turn; the run began again, corrected",
         "set frontend.readout_ms",
     ),
     "images-exchanged": Code(
         "degraded",
-        "left and right images are exchanged; they are put back, or left out",
+        "left and right images are exchanged; put back, or left out",
         "check how the two streams are told apart",
     ),
     "right-image-frozen": Code(
@@ -236,13 +236,13 @@ CODES: dict[str, Code] = {
     ),
     "no-features": Code(
         "degraded",
-        "no feature can be used; the pose is a prediction",
+        "no feature is used; the pose is a prediction",
         "more light or texture, or a shorter exposure",
     ),
     "few-features": Code(
         "degraded",
-        "too few features tell the scene from what moves on its own",
-        "more light or texture, a wider lens, a motion sensor",
+        "too few features tell the scene from passers-by",
+        "more light or texture",
     ),
     "features-refused": Code(
         "degraded",
@@ -250,17 +250,17 @@ CODES: dict[str, Code] = {
         "see the message",
     ),
     "estimate-restarted": Code(
-        "degraded", "the estimate diverged, and began again from the last good pose", ""
+        "degraded", "the estimate diverged, and began again from a good pose", ""
     ),
     "estimate-lost": Code("unusable", "the estimate diverged, and there is no pose", ""),
     "estimate-implausible": Code(
         "unusable",
-        "the estimate is none that a working rig can have",
+        "the estimate is impossible for a rig",
         "check the order of the images, calibration, units and clocks",
     ),
     "stereo-calibration-off": Code(
         "nominal",
-        "rows of left and right images differ in a smooth pattern; corrected while running",
+        "rows of left and right images differ smoothly; corrected while running",
         "vio calibrate",
     ),
     "other-calibration": Code(
