@@ -72,16 +72,13 @@ def _found(frames: Sequence[Observations]) -> list[Finding]:
     return [found for o in frames if (found := check.frame(o)) is not None]
 
 
-@pytest.mark.parametrize(("k1", "frame"), [(-0.3, 19), (-0.1, 39), (0.1, 39)])
+@pytest.mark.parametrize("k1", [-0.3, -0.1, 0.1])
 @pytest.mark.parametrize("rotation", [(0.0, 0.0, 0.0), (0.004, -0.003, 0.006)])
-def test_distortion_of_both_lenses_is_found_once(
-    k1: float, frame: int, rotation: Sequence[float]
-) -> None:
-    """Little of it only after 40 frames: the first ones are seldom known as well as they say."""
+def test_distortion_of_both_lenses_is_found_once(k1: float, rotation: Sequence[float]) -> None:
     turned = _turned(rotation)
     lens = radial(k1)
     (finding,) = _found(frames_seen(lens, lambda xy: turned(lens(xy)), 200))
-    assert (finding.code, finding.frame, finding.lasts) == ("other-calibration", frame, True)
+    assert (finding.code, finding.frame, finding.lasts) == ("other-calibration", 19, True)
     assert finding.figures["distorted_share"] * k1 > 0.0
 
 
@@ -132,6 +129,30 @@ def test_errors_that_features_keep_are_no_distortion(features: int, leave: float
         assert _found(frames) == [], seed
 
 
+def test_the_standard_error_covers_errors_that_a_part_of_the_image_shares() -> None:
+    """Rows of near things, of a twentieth of the image each, are off by 0.6 px in common, as at rims
+    and in textures that repeat, by other features in each frame: errors of 30 rigs over what is stated
+    of them. By features alone they come to 3.9.
+    """
+    over = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        shared = rng.normal(0.0, 0.6, (5, 4))
+        check = LensCheck(CAMERA)
+        for k in range(19):
+            xy = rng.uniform([-0.8, -0.5], [0.8, 0.5], (150, 2))
+            depth = rng.uniform(0.8, 20.0, 150)
+            moved = np.column_stack([CAMERA.baseline_m / depth, np.zeros(150)])
+            z = np.hstack([_pixels(xy), _pixels(xy - moved)]) + rng.normal(0.0, 0.2, (150, 4))
+            across, down = ((xy + [0.8, 0.5]) / [0.32, 0.25]).astype(int).T
+            z[:, 3] += shared[across, down] * (depth < 2.5)
+            check.frame(observations(k, k * 10**8, np.arange(150) + 150 * k, z))
+        found = check._share()
+        assert found is not None
+        over.append(found[0] / found[1])
+    assert np.sqrt(np.mean(np.square(over))) < 2.5
+
+
 def test_what_points_far_off_show_is_not_known(data_dir: Path) -> None:
     """Of tracks of KITTI, 50 a frame and with wrong ones, 28 % came out, 6.8 standard errors."""
     file = data_dir / "utias_kitti_klt" / "2011_09_26_drive_0036_sync_KLT.mat"
@@ -153,7 +174,7 @@ def test_distortion_is_found_after_frames_without_matches() -> None:
     lens = radial(-0.1)
     frames = frames_seen(lens, lens)
     blind = [observations(o.frame_index, o.time_ns, [], np.zeros((0, 4))) for o in frames[:30]]
-    assert [f.frame for f in _found([*blind, *frames])] == [39]
+    assert [f.frame for f in _found([*blind, *frames])] == [19]
 
 
 def test_what_is_kept_does_not_grow() -> None:

@@ -25,26 +25,27 @@ from vio.records import IntArray, Observations
 class _LensRules(NamedTuple):
     """When pixels are distorted."""
 
-    # Frames with matches, after which it is asked, and the share of its distance from the principal
-    # point that counts, by which a pixel moves where that squared is half the corners'. Healthy
-    # recordings have up to 0.014, of KITTI's own rectification. The few features of the first frames,
-    # of which many are at the rims of near things, come to 0.033 ± 0.005 in healthy renders.
-    looks: tuple[tuple[int, float], ...] = ((20, 0.1), (40, 0.03), (80, 0.03), (160, 0.03))
+    # frames with matches, after which it is asked
+    looked_at: tuple[int, ...] = (20, 40, 80, 160)
     most: int = 20  # whose matches are kept, spread over all so far
-    # of features, each of which is left out once: all matches of a feature have its error, which none
-    # of them shows
+    # Of features, each of which is left out once: all matches of a feature have its error, which none
+    # of them shows. So are cells of the image, along u and v: features at the rim of a near thing, and
+    # those of a texture that repeats, have errors in common.
     blocks: Tolerance[int] = 10
+    cells: tuple[int, int] = (4, 3)
     min_features: int = 100
     sigmas: float = 6.0  # beyond which it is known
     # … where these are small: of a scene that hardly shows it, what is no noise comes to more
     max_sigma: float = 0.01
+    # Share of its distance from the principal point by which a pixel moves where that squared is half
+    # the corners'. Healthy recordings have up to .014, of KITTI's own rectification.
+    min_share: float = 0.03
     steps: Tolerance[int] = 10  # of the robust fit, and of each that leaves a block out
-    further_steps: Tolerance[int] = 3
+    further_steps: Tolerance[int] = 2
     least_px: float = 0.1  # width of a row's error, at least
 
 
 _LENS = _LensRules()
-_LAST_LOOK = _LENS.looks[-1][0]
 _CODE = "other-calibration"
 
 
@@ -71,7 +72,7 @@ class LensCheck:
     @property
     def done(self) -> bool:
         """Whether it is not asked any more."""
-        return self._frames >= _LAST_LOOK
+        return self._frames >= _LENS.looked_at[-1]
 
     def frame(self, seen: Observations) -> Finding | None:
         """Return the finding after a frame."""
@@ -83,8 +84,7 @@ class LensCheck:
         if len(self._matches) > _LENS.most:
             del self._matches[1::2]
             self._every *= 2
-        min_share = dict(_LENS.looks).get(self._frames)
-        if min_share is None:
+        if self._frames not in _LENS.looked_at:
             return None
         found = self._share()
         if self.done:
@@ -92,9 +92,9 @@ class LensCheck:
         if found is None:
             return None
         share, sigma = found
-        if abs(share) <= max(min_share, _LENS.sigmas * sigma) or sigma > _LENS.max_sigma:
+        if abs(share) <= max(_LENS.min_share, _LENS.sigmas * sigma) or sigma > _LENS.max_sigma:
             return None
-        self._frames = _LAST_LOOK
+        self._frames = _LENS.looked_at[-1]
         self._matches.clear()
         index = seen.frame_index
         message = (
@@ -111,7 +111,6 @@ class LensCheck:
         is half the corners', and the standard error; None: too few features.
         """
         ids = np.concatenate([seen.ids for seen in self._matches])
-        block = _blocks(ids, _LENS.blocks)
         if len(np.unique(ids)) < _LENS.min_features:
             return None
         z = np.concatenate([seen.z for seen in self._matches])
@@ -121,12 +120,23 @@ class LensCheck:
         start = np.zeros(terms.shape[1])
         start[2] = median(rows)
         whole = cauchy_fit(terms, rows, start, least, _LENS.steps)
-        without = [
-            cauchy_fit(terms[block != k], rows[block != k], whole, least, _LENS.further_steps)
-            for k in range(_LENS.blocks)
-        ]
-        sigma = jackknife(np.array(without)[:, :2] @ self._squares)
-        return float(self._squares @ whole[:2]), float(sigma)
+        sigmas = []
+        for block in (_blocks(ids, _LENS.blocks), self._cells(z)):
+            without = [
+                cauchy_fit(terms[block != k], rows[block != k], whole, least, _LENS.further_steps)
+                for k in np.unique(block)
+            ]
+            sigmas.append(float(jackknife(np.array(without)[:, :2] @ self._squares)))
+        return float(self._squares @ whole[:2]), max(sigmas)
+
+    def _cells(self, z: FloatArray) -> IntArray:
+        """The cell (N,) of the image that left pixels of `[ul vl ur vr]` (N, 4) lie in."""
+        columns, rows = _LENS.cells
+        u = z[:, 0] / (self._camera.width or 2.0 * self._camera.cu)
+        v = z[:, 1] / (self._camera.height or 2.0 * self._camera.cv)
+        column = np.clip(u * columns, 0, columns - 1).astype(np.int64)
+        out: IntArray = column + columns * np.clip(v * rows, 0, rows - 1).astype(np.int64)
+        return out
 
     def _terms(self, z: FloatArray) -> FloatArray:
         """The terms (N, 13) of rows, those of k1 and k2 first: then those of (R2), the cubic ones of
