@@ -144,7 +144,7 @@ def test_the_standard_error_covers_errors_that_a_part_of_the_image_shares() -> N
             depth = rng.uniform(0.8, 20.0, 150)
             moved = np.column_stack([CAMERA.baseline_m / depth, np.zeros(150)])
             z = np.hstack([_pixels(xy), _pixels(xy - moved)]) + rng.normal(0.0, 0.2, (150, 4))
-            across, down = ((xy + [0.8, 0.5]) / [0.32, 0.25]).astype(int).T
+            across, down = ((xy + np.array([0.8, 0.5])) / [0.32, 0.25]).astype(int).T
             z[:, 3] += shared[across, down] * (depth < 2.5)
             check.frame(observations(k, k * 10**8, np.arange(150) + 150 * k, z))
         found = check._share()
