@@ -14,8 +14,8 @@ import pytest
 
 from vio.errors import DataError, EvaluationError
 from vio.evaluation.trajectories import evaluate
-from vio.files.text import check_increasing
 from vio.files.pose_matrices import are_matrix_files
+from vio.files.text import check_increasing
 from vio.files.trajectories import is_trajectory_file, read_trajectory, write_tum
 from vio.geometry.lie import (
     FloatArray,
@@ -835,7 +835,7 @@ def test_a_time_before_six_numbers_is_no_coordinate(
     for rows in (hovering, level):
         text = "\n".join(separator.join(map(repr, row)) for row in rows.tolist())
         (tmp_path / "a.txt").write_text(text)
-        with pytest.raises(DataError, match="or begin with the time, .* name them in a header"):
+        with pytest.raises(DataError, match=r"or begin with the time, .* name them in a header"):
             read_trajectory(tmp_path / "a.txt")
 
 

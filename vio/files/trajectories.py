@@ -135,9 +135,10 @@ def read_trajectory(
     """Read a trajectory; the format is detected from the content unless given.
 
     A KITTI file describes cam0 and has no times, as do TartanAir's (a position and a quaternion a row, of
-    axes forward, right and down), and matrices over four lines or in a file each, numbered in its name; KITTI-360's have the number of
-    the frame (or a time) before 12 numbers of the IMU's pose, or 16 of cam0's; an EuRoC file describes
-    the IMU; a TUM file describes the frame of its comment `# body: imu` or `# body: cam0`, else the IMU. `body`
+    axes forward, right and down), and matrices over four lines or in a file each, numbered in its
+    name; KITTI-360's have the number of the frame (or a time) before 12 numbers of the IMU's pose, or
+    16 of cam0's; an EuRoC file describes the IMU; a TUM file describes the frame of its comment
+    `# body: imu` or `# body: cam0`, else the IMU. `body`
     overrides all of these. A header may name the columns, in any order and among others, and the
     unit of the stamps. Where it does not, a quaternion has w first between commas and last between
     white space, which `Trajectory.orientations` says; quaternions of zeros, and files with four
