@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -243,3 +244,36 @@ def test_spectacular_ai_needs_an_imu(tmp_path: Path, capsys: pytest.CaptureFixtu
     given = ["convert", str(source), "--to", "spectacularai", "--out", str(tmp_path / "out")]
     assert main(given) == 1
     assert "needs an IMU" in capsys.readouterr().err
+
+
+def _matrices(folder: Path) -> Path:
+    folder.mkdir()
+    for k in range(5):
+        np.savetxt(
+            folder / f"{k}.txt", np.diag([1.0, 1, 1, 1]) + k * np.eye(4)[:, :1] @ [[0, 0, 0, 1]]
+        )
+    return folder
+
+
+def _over_four_lines(folder: Path) -> Path:
+    folder.mkdir()
+    lines = [file.read_text() for file in sorted(_matrices(folder / "each").iterdir())]
+    (folder / "poses.log").write_text("".join(lines))
+    return folder / "poses.log"
+
+
+def _without_times(folder: Path) -> Path:
+    folder.mkdir()
+    rows = "".join(f"{k} 0 0 0 0 0 1\n" for k in range(5))
+    (folder / "poses.txt").write_text("# tx ty tz qx qy qz qw\n" + rows)
+    return folder / "poses.txt"
+
+
+@pytest.mark.parametrize("make", [_matrices, _over_four_lines, _without_times])
+def test_all_forms_of_trajectories_that_are_read_are_converted(
+    make: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out.kitti"
+    source = make(tmp_path / "source")
+    assert main(["convert", str(source), "--to", "kitti", "--out", str(out)]) == 0
+    np.testing.assert_allclose(np.loadtxt(out)[:, 3], np.arange(5))

@@ -108,6 +108,10 @@ REFUSED: dict[str, tuple[Change, str]] = {
     ),
     "a disparity": (_column(2, lambda z: z[:, 0] - z[:, 2]), "a disparity; write ur = ul - dis"),
     "sixteenths": (_sixteenths, "sixteenths of a pixel, .*divide these by 16"),
+    "right from the centre": (
+        _column(2, lambda z: z[:, 2] - 610),
+        r"lie left of the image \(ur from -.*\); write ur vr in pixels of the right image",
+    ),
     "an image of both": (_column(2, lambda z: z[:, 2] + 1200), "subtract the width of one"),
     "no right rows": (_column(3, lambda z: 0 * z[:, 3]), "vr is 0 in all .* rows"),
     "right in another order": (_other_rows, "rows vl and vr of one id differ by .* another order"),
@@ -353,6 +357,23 @@ def test_a_plane_that_is_seen_without_noise_keeps_its_right_pixels(tmp_path: Pat
     assert recording.observations(0).has_right.sum() > 100
 
 
+def test_the_nearest_point_at_rest_keeps_its_right_pixel(tmp_path: Path) -> None:
+    arrays = _features(frames=1)
+    arrays |= {key: arrays[key][:60] for key in ("ids", "z", "has_right")}
+    z = arrays["z"].copy()
+    z[:, 2] = z[:, 0] - np.rint(z[:, 0] - z[:, 2])
+    disparity = np.where(arrays["has_right"], z[:, 0] - z[:, 2], 0.0)
+    assert (disparity > disparity.max() - 2).sum() == 1
+    rest = 60
+    counts = len(z) * np.arange(rest + 1)
+    arrays = {**arrays, "z": z, "offsets": counts, "frame_times_ns": 10**8 * np.arange(rest)}
+    arrays |= {key: np.concatenate([arrays[key]] * rest) for key in ("ids", "z", "has_right")}
+    recording = open_dataset(make_npz(tmp_path / "rest.npz", arrays))
+    assert recording.recording.notes == ()
+    nearest = int(np.argmax(disparity))
+    assert recording.observations(30).has_right[nearest]
+
+
 def _given_live(odometry: vio.Odometry, arrays: Arrays) -> int:
     """Give frames until one is refused, and return how many were taken."""
     for k, (a, b) in enumerate(zip(arrays["offsets"], arrays["offsets"][1:], strict=False)):
@@ -383,3 +404,21 @@ def test_healthy_live_features_are_taken() -> None:
     estimate = odometry.estimate
     assert estimate is not None
     np.testing.assert_allclose(estimate.T_world_imu[:3, 3], [0, 0, 13], atol=0.1)
+
+
+def _begins_anew(arrays: Arrays) -> Arrays:
+    """Ids of a tracker that loses all points in each of its first frames, as exposure settles."""
+    frames = np.repeat(np.arange(len(arrays["offsets"]) - 1), np.diff(arrays["offsets"]))
+    return {**arrays, "ids": arrays["ids"] + 1000 * np.minimum(frames, 3)}
+
+
+def _marked_by_numbers(arrays: Arrays) -> Arrays:
+    z = arrays["z"].copy()
+    z[~arrays["has_right"] | (np.arange(len(z)) % 3 == 0), 2:] = -100
+    return {**arrays, "z": z, "has_right": np.ones(len(z), dtype=bool)}
+
+
+@pytest.mark.parametrize("change", [_begins_anew, _marked_by_numbers])
+def test_live_features_that_files_may_hold_are_taken(change: Change) -> None:
+    odometry = vio.Odometry(CAMERA, vio.load_config(overrides=["motion=none"]))
+    assert _given_live(odometry, change(_features(frames=12))) == 12

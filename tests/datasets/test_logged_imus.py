@@ -109,6 +109,7 @@ def test_an_imu_of_unknown_pose_is_noted_and_the_images_are_used(tmp_path: Path)
         ("{\n", "line 1: is no JSON"),
         ('{"gyro": ["a", "b", "c"], "time": 1}\n', "holds no readings of the gyro"),
         ("[" * 100_000, "line 1: is no JSON"),
+        ('{}\n{"time": \n{}\n', "line 2: is no JSON"),
     ],
 )
 def test_other_json_lines_are_noted(text: str, words: str, tmp_path: Path) -> None:
@@ -117,6 +118,17 @@ def test_other_json_lines_are_noted(text: str, words: str, tmp_path: Path) -> No
     recording, found = _read(folder)
     assert found == []
     assert any("not read: " in note and words in note for note in recording.notes)
+
+
+def test_a_last_line_that_was_cut_is_left_out(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path / "plain")
+    _, expected = _read(folder)
+    text = "".join(f"{_edex(t, r)}\n" for t, r in _rows(folder))
+    (folder / "imu.jsonl").write_text(text[:-20])
+    recording, found = _read(folder)
+    assert len(found) >= len(expected) - 1 > 0
+    assert found == expected[: len(found)]
+    assert any("the last line was cut, and is left out" in note for note in recording.notes)
 
 
 def test_ten_columns_of_another_name_are_refused(tmp_path: Path) -> None:

@@ -430,6 +430,16 @@ def test_ros_pair_is_read(tmp_path: Path) -> None:
         assert rig.cam1.coefficients[:4] == RIG.cam1.coefficients
 
 
+def test_a_projection_that_was_computed_in_single_precision_is_one(tmp_path: Path) -> None:
+    m = opencv_matrices()
+    P = m["P2"].copy()
+    P[1, 0] = -2e-5  # of products whose terms are hundreds of pixels
+    P[2, :3] += [3e-8, -6e-8, 1.2e-7]
+    write_ros_pair(tmp_path)
+    (tmp_path / "right.yaml").write_text(ros_yaml(m["M2"], m["D2"], m["R2"], P, "right"))
+    np.testing.assert_allclose(vio.load_rig(tmp_path).T_cam1_cam0, T_CAM1_CAM0, atol=1e-6)
+
+
 BOOFCV = """<boofcv.struct.calib.StereoParameters>
   <left><cx>156.2</cx><cy>123.7</cy><flipY>false</flipY><fx>262.3</fx><fy>263.4</fy><height>240</height>
     <radial><double>-0.36</double><double>0.17</double></radial><skew>0.0</skew><width>320</width></left>

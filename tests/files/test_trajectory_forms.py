@@ -14,6 +14,7 @@ import pytest
 
 from vio.errors import DataError, EvaluationError
 from vio.evaluation.trajectories import evaluate
+from vio.files.pose_matrices import are_matrix_files
 from vio.files.text import check_increasing
 from vio.files.trajectories import is_trajectory_file, read_trajectory, write_tum
 from vio.geometry.lie import (
@@ -733,16 +734,18 @@ def test_times_under_the_name_of_a_frame_are_times(name: str, tmp_path: Path) ->
 
 
 def test_poses_without_times_are_those_of_frames(tmp_path: Path) -> None:
-    x = [repr(float(p)) for p in P[:, 0]]
+    back = slice(None, None, -1)  # x falls, as no time does
+    x = [repr(float(p)) for p in P[back, 0]]
     forms = {
         "a.csv": ("x,y,z,qx,qy,qz,qw", XYZW[1:], ","),
         "pose_left.txt": ("", XYZW[1:], " "),
         "b.csv": ("", WXYZ[1:], ","),
     }
     for name, (header, columns, separator) in forms.items():
-        read = read_trajectory(_write(tmp_path / name, header, x, [P[:, 1:], *columns], separator))
+        values = [P[back, 1:], *(c[back] for c in columns)]
+        read = read_trajectory(_write(tmp_path / name, header, x, values, separator))
         assert (read.times_ns, read.frame_indices, read.body) == (None, None, "cam0")
-        np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body, atol=1e-12)
+        np.testing.assert_allclose(read.T_world_body, TRUTH.T_world_body[back], atol=1e-12)
 
 
 def test_the_state_of_openvins_is_read(tmp_path: Path) -> None:
@@ -799,7 +802,53 @@ def test_files_of_single_matrices_may_be_named_by_times(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_trajectory(tmp_path).times_ns, TIMES_NS)
 
 
+@pytest.mark.parametrize("name", ["{:06d}_cam0.txt", "cam0.{:06d}.txt", "pose_{:04d}_of_12.txt"])
+def test_other_numbers_in_the_names_of_files_are_not_those_of_frames(
+    name: str, tmp_path: Path
+) -> None:
+    for k, T in enumerate(TRUTH.T_world_body):
+        (tmp_path / name.format(k)).write_text(_matrix_text(T))
+    read = read_trajectory(tmp_path)
+    assert read.times_ns is None
+    np.testing.assert_array_equal(read.frame_indices, np.arange(COUNT))
+
+
+@pytest.mark.parametrize("names", [["T_cam0_imu.txt"], ["T_cam0_imu.txt", "P_cam0.txt"]])
+def test_matrices_of_a_rig_are_no_trajectory(names: list[str], tmp_path: Path) -> None:
+    for name in names:
+        (tmp_path / name).write_text(_matrix_text(np.eye(4)))
+    assert not are_matrix_files(tmp_path)
+    with pytest.raises(DataError, match="is a folder"):
+        read_trajectory(tmp_path)
+
+
+@pytest.mark.parametrize("separator", [" ", ","])
+@pytest.mark.parametrize("first_s", [0.0, 1.5e9])
+def test_a_time_before_six_numbers_is_no_coordinate(
+    first_s: float, separator: str, tmp_path: Path
+) -> None:
+    """A height of one metre beside small angles, or a plane position, has the norm 1, too."""
+    k = np.arange(COUNT)
+    clock = first_s + 0.1 * k + 0.1 * (k > 9)  # a frame is lost
+    hovering = np.column_stack([clock, 0.1 * k, 0 * k, 0 * k + 1, 0.01 * np.sin(k), 0 * k, 0 * k])
+    level = np.column_stack([clock, k, -k, 0 * k, 0 * k, np.sin(k), np.cos(k)])
+    for rows in (hovering, level):
+        text = "\n".join(separator.join(map(repr, row)) for row in rows.tolist())
+        (tmp_path / "a.txt").write_text(text)
+        with pytest.raises(DataError, match=r"or begin with the time, .* name them in a header"):
+            read_trajectory(tmp_path / "a.txt")
+
+
+def test_a_header_says_that_there_is_no_time(tmp_path: Path) -> None:
+    x = [repr(0.5 * k) for k in range(COUNT)]
+    file = _write(tmp_path / "a.txt", "# tx ty tz qx qy qz qw", x, [P[:, 1:], *XYZW[1:]])
+    read = read_trajectory(file)
+    assert read.times_ns is None
+    np.testing.assert_allclose(read.positions[:, 0], 0.5 * np.arange(COUNT))
+
+
 def test_files_that_are_no_single_matrix_are_named(tmp_path: Path) -> None:
+    (tmp_path / "1.txt").write_text(_matrix_text(np.eye(4)))
     (tmp_path / "0.txt").write_text("1 2 3\n")
     with pytest.raises(DataError, match=r"0.txt: holds 3 numbers, not the 16"):
         read_trajectory(tmp_path)

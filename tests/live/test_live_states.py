@@ -4,11 +4,12 @@ worker that has ended.
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -22,6 +23,7 @@ from vio.geometry.lie import se3_from_parts, se3_log
 from vio.live.inputs import _Stamps
 from vio.live.live_odometry import LiveOdometry
 from vio.live.prediction import PosePredictor
+from vio.live.worker import QuietCollector
 from vio.records import FrameResult
 
 CONFIG = replace(Config(), motion="none")
@@ -34,8 +36,23 @@ def _add(live: LiveOdometry, k: int) -> None:
     live.add_observations(k * STEP_NS, SEEN[k].ids, SEEN[k].z)
 
 
+_OPEN: list[LiveOdometry] = []
+
+
+@pytest.fixture(autouse=True)
+def closed_at_the_end() -> Iterator[None]:
+    """One that stays open keeps its thread, and the collector of the process as it set it up."""
+    users = QuietCollector._users
+    yield
+    while _OPEN:
+        with contextlib.suppress(VioError):  # what made it fail
+            _OPEN.pop().close()
+    assert QuietCollector._users == users
+
+
 def _running(on_frame: Callable[[FrameResult], None] | None = None) -> LiveOdometry:
     live = LiveOdometry(CAMERA, CONFIG, T_cam0_imu=T_CAM0_IMU, on_frame=on_frame, drop="none")
+    _OPEN.append(live)
     _add(live, 0)
     return live
 

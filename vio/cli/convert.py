@@ -18,6 +18,7 @@ from vio.errors import NOTE, ConfigError
 MARKER = "conversion.json"
 _FORMS = ("euroc", "kitti", "plain", "rosbag2", "mcap", "spectacularai")
 _TRAJECTORIES = ("tum", "kitti", "euroc")
+_TEXTS = (".txt", ".csv", ".log", ".tum")  # of poses in forms that their first line does not tell
 
 
 def add_parser(commands: Any) -> None:
@@ -53,18 +54,34 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from vio.files.trajectories import is_trajectory_file
-
-    if args.to == "tum" or is_trajectory_file(Path(args.source)):
+    if args.to == "tum" or _is_trajectory(Path(args.source)):
         return _trajectory(args)
     return _recording(args)
+
+
+def _is_trajectory(path: Path) -> bool:
+    """Return whether a file, or a folder of matrices, holds poses in any form that is read."""
+    from vio.errors import DataError
+    from vio.files.pose_matrices import are_matrix_files
+    from vio.files.trajectories import is_trajectory_file, read_trajectory
+
+    if path.is_dir():
+        return are_matrix_files(path)
+    if is_trajectory_file(path):
+        return True
+    if not path.is_file() or path.suffix.lower() not in _TEXTS:
+        return False
+    try:
+        read_trajectory(path)
+    except DataError:
+        return False
+    return True
 
 
 def _trajectory(args: argparse.Namespace) -> int:
     """Write a trajectory, or the ground truth of a recording."""
     from vio.datasets import open_dataset
     from vio.files.atomic import check_new_file
-    from vio.files.trajectories import is_trajectory_file
     from vio.offline.convert_trajectory import convert_trajectory, write_reference
 
     source = Path(args.source)
@@ -74,7 +91,7 @@ def _trajectory(args: argparse.Namespace) -> int:
             "--start and --end choose frames of a recording to convert, not poses; leave them out"
         )
     check_new_file(args.out)
-    if not is_trajectory_file(source):
+    if not _is_trajectory(source):
         written = write_reference(open_dataset(args.source, config.dataset), args.out)
     elif args.to in _TRAJECTORIES:
         calibration = config.dataset.calibration

@@ -32,7 +32,8 @@ class _Rules(NamedTuple):
     normalised_max: float = 10.0  # no image has all its pixels nearer to its corner …
     least_focal: float = 100.0  # … where the focal length is this long, in pixels
     unlike: float = 0.05  # share by which the focal lengths of a rectified pair never differ
-    again: float = 0.01  # share of the features whose ids the next frame has
+    again: float = 0.01  # share of the features whose ids the next frame has …
+    pairs: int = 4  # … of so many pairs of frames or more: a tracker may begin anew
     scatter: float = 0.6  # of a point's motion beside that of two of any ids
     beyond: float = 3.0  # times the principal point, where no image of one size ends
     parts: int = 32  # of a pixel, in which pixels may be measured
@@ -40,6 +41,7 @@ class _Rules(NamedTuple):
     steps: float = 16.0  # of a pixel, in which matchers write disparities as whole numbers
     same_px: float = 1e-3  # disparities that are one number, but for rounding
     least_capped: int = 20  # rows that share the largest disparity …
+    points_capped: int = 8  # … of so many points, not of a few at rest …
     capped: float = 0.01  # … a share of all …
     of_a_plane: float = 0.5  # share above which they may be those of one plane, without noise
     crowded: float = 3.0  # … times the rows within a pixel below it
@@ -103,10 +105,13 @@ def _capped(tracks: FeatureTracks) -> tuple[BoolArray, float, float]:
     if len(known) < _RULES.least_capped:
         return none, 0.0, 0.0
     top = float(np.rint(known.max()))
-    at_top = int((np.abs(known - top) <= _RULES.same_px).sum())
+    is_top = tracks.has_right & (np.abs(disparity - top) <= _RULES.same_px)
+    at_top = int(is_top.sum())
     below = int(((known < top - _RULES.same_px) & (known > top - 1 - _RULES.same_px)).sum())
     share = at_top / len(known)
-    is_cap = at_top >= _RULES.least_capped and share >= _RULES.capped
+    points = len(np.unique(tracks.ids[is_top]))
+    is_cap = at_top >= _RULES.least_capped and points >= _RULES.points_capped
+    is_cap &= share >= _RULES.capped
     if not is_cap or top < known.max() - _RULES.same_px or at_top < _RULES.crowded * below:
         return none, 0.0, 0.0
     return np.abs(disparity - top) <= _RULES.same_px, top, share
@@ -313,7 +318,7 @@ def _of_right_places(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
         return None
     inside = float(np.mean(z[:, 0] - disparity / _RULES.steps >= -_RULES.near_px))
     where = f"{100 * outside:.0f} % of the right pixels lie left of the image (ur from {z[:, 2].min():.0f})"
-    if inside < 1 - _RULES.few:
+    if inside < 1 - _RULES.few or not is_whole:
         return f"{where}; write ur vr in pixels of the right image, and mark those not found"
     return (
         f"{where}: disparities are in sixteenths of a pixel, as OpenCV's StereoBM and StereoSGBM "
@@ -355,7 +360,7 @@ def _of_ids(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
     """Whether an id is one point: what one shows in two frames is nearer than what any two do."""
     del camera
     shares = []
-    seen = again = 0
+    seen = again = pairs = 0
     ends = tracks.offsets.tolist()
     for first, second, last in zip(ends, ends[1:], ends[2:], strict=False):
         if min(second - first, last - second) < _RULES.fewest:
@@ -363,13 +368,14 @@ def _of_ids(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
         before = slice(first, second)
         after = slice(second, last)
         rows, others = shared_rows(tracks.ids[before], tracks.ids[after])
+        pairs += 1
         seen += second - first
         again += len(rows)
         if len(rows) >= _RULES.fewest:
             in_order = rows.argsort()  # of the rows, so that those half of them apart are apart
             from_px = tracks.z[before, :2][rows[in_order]]
             shares.append(_scatter(from_px, tracks.z[after, :2][others[in_order]]))
-    if again < _RULES.again * seen:
+    if pairs >= _RULES.pairs and again < _RULES.again * seen:
         return (
             f"of {seen} features {again} have an id that the next frame has, too; give a point one id "
             "in all frames that show it"

@@ -41,7 +41,7 @@ class _Reading(NamedTuple):
 
 def read_imu_lines(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
     """Read the gyro (rad/s) and the accelerometer (m/s^2) of a file of JSON Lines; lines of other
-    content are skipped.
+    content, and a last line that was cut, are skipped.
 
     Returns:
         The record, with the acceleration interpolated where the stamps differ, and notes.
@@ -49,8 +49,8 @@ def read_imu_lines(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
     Raises:
         DataError: a line is no JSON, or there are no readings of one of the two.
     """
-    readings = list(_readings(path))
     found: list[str] = []
+    readings = list(_readings(path, found))
     gyro = _of_sensor(path, [r for r in readings if r.sensor == "w"], "gyro", found)
     accel = _of_sensor(path, [r for r in readings if r.sensor == "a"], "accelerometer", found)
     notes = dict.fromkeys(found)  # the unit of the times is that of both
@@ -63,17 +63,25 @@ def read_imu_lines(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
     return joined, (*notes, *sampling_notes(joined, str(path)))
 
 
-def _readings(path: Path) -> Iterator[_Reading]:
+def _readings(path: Path, notes: list[str]) -> Iterator[_Reading]:
+    fault: DataError | None = None  # of the line before, which may be the last one
+    is_first = True
     for number, line in lines_of(path):
         if not line.strip():
             continue
+        if fault is not None:
+            raise fault
         try:
             # numbers as they are written, so that no stamp is rounded
             entry = json.loads(line, parse_float=str, parse_int=str)
         except (ValueError, RecursionError) as error:
-            raise DataError(
+            fault = DataError(
                 f"{path}, line {number}: is no JSON ({error}); write one object a line, as {_FORM}"
-            ) from error
+            )
+            if is_first:
+                raise fault from error
+            continue
+        is_first = False
         if not isinstance(entry, dict):
             continue
         key = next((key for key in _TIMES if isinstance(entry.get(key), str)), None)
@@ -83,6 +91,8 @@ def _readings(path: Path) -> Iterator[_Reading]:
             sensor = sensor_of(name)
             if sensor:
                 yield _Reading(sensor, key, entry[key], values, number)
+    if fault is not None:
+        notes.append(f"{path}: the last line was cut, and is left out")
 
 
 def _vectors(entry: dict[str, Any]) -> Iterator[tuple[str, list[float]]]:

@@ -20,7 +20,8 @@ _ABOVE = 3  # numbers of the line above a matrix in Redwood's log
 _COUNTS = (_SIDE * (_SIDE - 1), _SIDE * _SIDE)  # numbers of a pose
 _LAST = [0.0, 0.0, 0.0, 1.0]
 _SUFFIXES = (".txt", ".pose", ".csv")
-_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+# a time with decimals, but not the 0.000123 of cam0.000123
+_NUMBER = re.compile(r"\d{9,}\.\d+|(?<![A-Za-z\d.])\d+\.\d+|\d+")
 
 
 def joined_matrices(rows: Sequence[str]) -> tuple[list[str], list[int]] | None:
@@ -92,18 +93,20 @@ def matrices_of_files(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def _numbered_files(folder: Path) -> list[tuple[float, str, Path]]:
-    """Return the text files of a folder by the last numbers in their names, which stand before them as
-    a value and as written; empty where some have none.
+    """Return the text files of a folder by the last numbers in their names that differ, which stand
+    before them as a value and as written; empty where some have none, or there is one file.
     """
-    files = []
+    named: list[tuple[list[str], Path]] = []
     for path in folder.iterdir():
-        if path.suffix not in _SUFFIXES or path.name.startswith(".") or not path.is_file():
-            continue
-        numbers = _NUMBER.findall(path.stem)
-        if not numbers:
-            return []
-        files.append((float(numbers[-1]), numbers[-1], path))
-    return sorted(files)
+        if path.suffix in _SUFFIXES and not path.name.startswith(".") and path.is_file():
+            named.append((_NUMBER.findall(path.stem), path))
+    if len(named) < 2:
+        return []
+    for place in range(1, min(len(numbers) for numbers, _ in named) + 1):
+        files = [(float(numbers[-place]), numbers[-place], path) for numbers, path in named]
+        if len({value for value, _, _ in files}) == len(files):
+            return sorted(files)
+    return []
 
 
 def _numbers_of(path: Path) -> list[str]:

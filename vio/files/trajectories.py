@@ -66,6 +66,8 @@ class _PoseRules(NamedTuple):
     max_frame_number: int = 10_000_000  # whole numbers beyond are times
     largest: Tolerance[float] = 1.001  # an element of a rotation
     rounded_norm: float = 0.02  # from one, of quaternions with two decimals
+    even_step: float = 0.2  # between times, from the usual one …
+    even_steps: float = 0.8  # … of this share of the rows
     exact_deviation: Tolerance[float] = 1e-12  # rotations this close to orthonormal keep their bits
 
 
@@ -132,10 +134,11 @@ def read_trajectory(
 ) -> Trajectory:
     """Read a trajectory; the format is detected from the content unless given.
 
-    A KITTI file describes cam0 and has no times, as do TartanAir's (a position and a quaternion a row),
-    and matrices over four lines or in a file each, numbered in its name; KITTI-360's have the number of
-    the frame (or a time) before 12 numbers of the IMU's pose, or 16 of cam0's; an EuRoC file describes
-    the IMU; a TUM file describes the frame of its comment `# body: imu` or `# body: cam0`, else the IMU. `body`
+    A KITTI file describes cam0 and has no times, as do TartanAir's (a position and a quaternion a row, of
+    axes forward, right and down), and matrices over four lines or in a file each, numbered in its
+    name; KITTI-360's have the number of the frame (or a time) before 12 numbers of the IMU's pose, or
+    16 of cam0's; an EuRoC file describes the IMU; a TUM file describes the frame of its comment
+    `# body: imu` or `# body: cam0`, else the IMU. `body`
     overrides all of these. A header may name the columns, in any order and among others, and the
     unit of the stamps. Where it does not, a quaternion has w first between commas and last between
     white space, which `Trajectory.orientations` says; quaternions of zeros, and files with four
@@ -207,7 +210,22 @@ def _untimed_columns(table: _Table, named: PoseColumns | None) -> PoseColumns | 
     norm = np.linalg.norm(_floats(table, (x, y, z, w), finite=False), axis=1)
     if not (np.abs(norm - 1) <= _POSES.rounded_norm).all():
         return None
+    if _rises_as_a_clock(_floats(table, (0,), finite=False)[:, 0]):
+        raise DataError(
+            f"{table.path}: its seven columns may be a position and a quaternion, or begin with the time, by how "
+            "evenly the first one rises; name them in a header, as tx ty tz qx qy qz qw"
+        )
     return replace(columns, position=(0, 1, 2), quaternion=(x, y, z, w))
+
+
+def _rises_as_a_clock(values: FloatArray) -> bool:
+    """Return whether numbers (N,) rise from row to row, and nearly all by one step."""
+    steps = np.diff(values)
+    if len(steps) == 0 or not (steps > 0).all():
+        return False
+    usual = float(np.median(steps))
+    even = np.abs(steps - usual) <= _POSES.even_step * usual
+    return float(np.mean(even)) >= _POSES.even_steps
 
 
 def _untimed(table: _Table, columns: PoseColumns, body: BodyFrame | None) -> Trajectory:

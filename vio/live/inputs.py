@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from vio.datasets.feature_forms import features_fault
+from vio.datasets.feature_forms import features_fault, without_placeholders
 from vio.datasets.frame_times import FrameRateLimit
 from vio.errors import ConfigError, DataError, OrderError
 from vio.filters.inputs import LARGEST
@@ -194,7 +194,7 @@ class Inputs:
         so_far = [*self._first_seen, seen]
         if len(so_far) not in _EXAMINED_AFTER:
             return
-        tracks = feature_tracks(dict(enumerate(so_far)), len(so_far))
+        tracks, _ = without_placeholders(feature_tracks(dict(enumerate(so_far)), len(so_far)))
         if fault := features_fault(self._rectified, tracks):
             raise DataError(f"features of the first {len(so_far)} frames: {fault}")
 
