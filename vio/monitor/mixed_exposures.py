@@ -237,10 +237,10 @@ def _differences(image: Image, u: int, v: int, differences: FloatArray) -> None:
     k = 0
     for y in range(v - _INNER_PX, v + _INNER_PX + 1):
         for x in range(u - _INNER_PX, u + _INNER_PX + 1):
-            right, left = image[y, x + _STEP_PX], image[y, x - _STEP_PX]
-            below, above = image[y + _STEP_PX, x], image[y - _STEP_PX, x]
-            differences[k] = np.int32(right) - np.int32(left)
-            differences[k + 1] = np.int32(below) - np.int32(above)
+            along = np.int32(image[y, x + _STEP_PX]) - np.int32(image[y, x - _STEP_PX])
+            down = np.int32(image[y + _STEP_PX, x]) - np.int32(image[y - _STEP_PX, x])
+            differences[k] = along
+            differences[k + 1] = down
             k += 2
 
 
