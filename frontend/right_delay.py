@@ -102,6 +102,11 @@ class RightDelay(Finder):
         """
         return self.frames - 1.0 if self._early else self.frames
 
+    @property
+    def explained(self) -> float:
+        """Share of the rows' scatter about the constant field that the delay explains."""
+        return self._significance()[2]
+
     def paired(self, right: Image) -> Image | None:
         """Return the right image (H, W) of the present left image's time; None: it was not kept."""
         if not self._early:

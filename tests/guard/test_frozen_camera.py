@@ -52,3 +52,21 @@ def test_a_repeated_right_image_does_not_freeze_the_left_one() -> None:
     repeated = moving.copy()
     repeated[20] = repeated[19]
     assert not _frozen_frames(moving, repeated)
+
+
+@pytest.mark.parametrize("step_px", [0, 1])
+@pytest.mark.parametrize("share", [0.2, 0.5, 1.0])
+def test_what_covers_the_right_image_does_not_freeze_the_left_one(
+    step_px: int, share: float
+) -> None:
+    """A hand or a wiper at a standstill, or lines that are lost."""
+    rng = np.random.default_rng(2)
+    check = FrozenCamera()
+    frozen: list[int] = []
+    for k in range(40):
+        right = _image(step_px * k + 10, rng)
+        if k > 10 and k % 5 < 2:
+            right[:, : int(share * WIDTH)] = rng.integers(0, 255, (HEIGHT, int(share * WIDTH)))
+        if check.left_is_frozen(k, _image(step_px * k, rng), right):
+            frozen.append(k)
+    assert not frozen

@@ -614,3 +614,18 @@ def test_pairs_a_frame_apart_on_a_straight_drive_are_found(delay: int) -> None:
 
 def test_pairs_of_a_straight_drive_are_not_apart() -> None:
     assert codes(inspected(_straight_drive())[1]) == []
+
+
+def _bent_pixels(seen: Sequence[Observations]) -> float:
+    """Root mean square of what rows of right pixels differ by, towards the end."""
+    last = seen[-1]
+    return float(np.sqrt(np.mean((last.z[last.has_right, 3] - last.z[last.has_right, 1]) ** 2)))
+
+
+@pytest.mark.parametrize("nod", [0.7, 1.5, 3.0])
+def test_right_pixels_that_are_a_frame_early_are_taken_from_the_frame_before(nod: float) -> None:
+    seen = flight(nod=nod)
+    out, found = inspected([with_right_of(seen[k], seen[k + 1]) for k in range(FRAMES - 1)])
+    assert codes(found) == ["pairs-shifted"]
+    assert found[0].figures["delay_frames"] == -1.0
+    assert _bent_pixels(out) < 1.2 * _bent_pixels(seen)

@@ -10,8 +10,9 @@ import pytest
 
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
+from vio.monitor import mixed_exposures
 from vio.monitor.mixed_exposures import MixedExposures
-from vio.records import Image, observations
+from vio.records import Image, Observations, observations
 
 HEIGHT = 240
 WIDTH = 400
@@ -91,6 +92,31 @@ def test_the_frame_before_is_found_in_images(mix: Mix, lost: tuple[int, ...]) ->
     assert begun.frame is not None
     assert begun.frame <= SINCE + 4
     assert begun.figures["share"] == pytest.approx(0.4, abs=0.12)
+
+
+@pytest.mark.parametrize("since", range(40, 48))
+def test_blends_that_begin_later_are_found_by_few_looks(
+    since: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[int] = []
+
+    def counted(seen: list[Observations], images: list[Image]) -> tuple[float, float] | None:
+        looks.append(seen[-1].frame_index)
+        return share_of_before(seen, images)
+
+    share_of_before = mixed_exposures._share_of_before
+    monkeypatch.setattr(mixed_exposures, "_share_of_before", counted)
+    steps_px = [*STEPS_PX, *STEPS_PX][:70]
+
+    def mix(exposures: Exposures, k: int) -> FloatArray:
+        return 0.5 * (exposures[k] + exposures[k - 1]) if k >= since and k % 2 else exposures[k]
+
+    begun = _found(mix, steps_px)[0]
+    assert begun.first_frame is not None
+    assert begun.frame is not None
+    assert since - 7 <= begun.first_frame <= since
+    assert begun.frame <= since + 12
+    assert sum(25 <= k < since for k in looks) <= 0.4 * (since - 25) + 1
 
 
 def test_it_ends_where_images_show_one_exposure_again() -> None:

@@ -1,6 +1,8 @@
 """A camera of the pair that is frozen, dark or covered, by the images themselves.
 
-An image that stays the same, up to noise, while the other camera's changes is frozen.
+An image that stays the same, up to noise, while the other camera's changes is frozen. A left one has
+changed just before, too: at a standstill it stays the same, and what covers the right one changes
+that.
 """
 
 from __future__ import annotations
@@ -64,6 +66,8 @@ class FrozenCamera(ImageCheck):
         super().__init__()
         self._last: _SparseImages | None = None  # the last frame in which no image was frozen
         self._ratio = 1.0  # usual change of the right image over that of the left one
+        # change of the left image in the last frame in which no image was frozen
+        self._moved_left = 0.0
         self._cause: Cause | None = None  # why the right image is not used
         self._since = 0  # frame before the first such frame
         self._count = 0  # such frames in a row
@@ -106,7 +110,8 @@ class FrozenCamera(ImageCheck):
         )
         change_left = image_change(now.left, last.left)
         change_right = image_change(now.right, last.right)
-        if not is_dark and _is_frozen(change_left * self._ratio, change_right):
+        has_stopped = change_left < _FROZEN.frozen_share * self._moved_left
+        if not is_dark and has_stopped and _is_frozen(change_left * self._ratio, change_right):
             self._count_left(last.index, index)
             return True
         self._end_left(index)
@@ -120,6 +125,7 @@ class FrozenCamera(ImageCheck):
             self._end_right(index)
         elif change_left > _FROZEN.min_change:
             self._ratio += _FROZEN.ratio_gain * (change_right / change_left - self._ratio)
+        self._moved_left = change_left
         self._last = now
         return False
 

@@ -18,6 +18,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
+from vio.numerics.compiled import compiled, compiled_sums
 from vio.numerics.kinds import Capacity
 from vio.numerics.robust import median
 from vio.records import Image, IntArray, Observations, shared_rows
@@ -41,15 +42,22 @@ class _MixedRules(NamedTuple):
     frames: int = 6  # the newest that tell, of which …
     mixed: int = 2  # … so many have it before it is reported
     clear_frames: int = 20  # in a row that do not, before it is over
+    # After so many frames that tell, and while none of the newest has it, two in a row of so many are
+    # looked at: every second frame may be a blend. A prime, so that no other pattern is missed.
+    first_frames: int = 20
+    period: int = 7
 
 
 _MIXED = _MixedRules()
+_STEP_PX = _MIXED.step_px
+_INNER_PX = _MIXED.radius_px - _STEP_PX  # of the differences' centres in a patch
+_DIFFERENCES = 2 * (2 * _INNER_PX + 1) ** 2  # of a patch
 _CODE = "exposures-mixed"
 
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    before: int  # number of the frame before
+    since: int  # number of the frame before it, or before those that were passed over last
     share: float  # of the frame before in its image
     least: float  # what that is at least
 
@@ -66,6 +74,10 @@ class MixedExposures:
         self._images = deque[Image](maxlen=3)
         self._seen = deque[Observations](maxlen=3)
         self._frames = deque[_Frame](maxlen=_MIXED.frames)
+        self._told = 0  # frames
+        self._number = 0  # of frames with two before
+        self._passes = False  # the present frame is not looked at
+        self._passed_since: int | None = None  # frame before those that were passed over last
         self._reported = False
         self._clear = 0  # frames in a row
 
@@ -82,11 +94,32 @@ class MixedExposures:
         self._seen.append(seen)
         if len(self._images) < 3:
             return []
+        before = self._seen[1].frame_index
+        self._choose(before)
+        if self._passes:
+            return []
+        since = before if self._passed_since is None else self._passed_since
         found = _share_of_before(list(self._seen), list(self._images))
         if found is None or found[0] > _MIXED.most_share:
             return []
-        self._frames.append(_Frame(self._seen[-2].frame_index, *found))
+        self._told += 1
+        self._frames.append(_Frame(since, *found))
         return self._judged(seen.frame_index)
+
+    def _choose(self, before: int) -> None:
+        """Choose whether the present frame is passed over, as nothing has been found for long.
+
+        `before`: number of the frame before.
+        """
+        passed = self._passes
+        self._number = (self._number + 1) % _MIXED.period
+        suspected = self._reported or any(frame.is_mixed for frame in self._frames)
+        is_rare = not suspected and self._told >= _MIXED.first_frames
+        self._passes = is_rare and self._number > 1
+        if not is_rare:
+            self._passed_since = None
+        elif self._passes and not passed:
+            self._passed_since = before
 
     def _judged(self, index: int) -> list[Finding]:
         mixed = [frame for frame in self._frames if frame.is_mixed]
@@ -110,7 +143,7 @@ class MixedExposures:
         doubted = min(share / max(1.0 - share, share), 1.0)
         figures = {"share": share, "doubted_share": doubted}
         # the motion into the first such frame is in doubt already
-        return [Finding(_CODE, message, index, mixed[0].before, lasts=True, figures=figures)]
+        return [Finding(_CODE, message, index, mixed[0].since, lasts=True, figures=figures)]
 
 
 def _share_of_before(seen: list[Observations], images: list[Image]) -> tuple[float, float] | None:
@@ -132,18 +165,17 @@ def _share_of_before(seen: list[Observations], images: list[Image]) -> tuple[flo
     source = source[::every]
     if len(place) < _MIXED.min_features:
         return None
-    first, last, image = images
-    came = _differences(last, source)
-    parts = np.stack([came, _differences(last, place), _differences(first, place)], axis=2)
-    usable = np.sqrt(np.mean(parts[:, :, 1] ** 2, axis=1)) >= _MIXED.min_gradient
-    count = int(usable.sum())
+    products = np.empty((len(place), 4, 3))
+    # of one type for the compiled loop, which would be compiled anew for others
+    first, last, newest = (np.require(image, requirements=["C", "W"]) for image in images)
+    _products((first, last, newest), place, source, products)
+    mean_square = products[:, 1, 1] / _DIFFERENCES
+    products = products[mean_square >= _MIXED.min_gradient**2]
+    count = len(products)
     if count < _MIXED.min_features:
         return None
-    parts = parts[usable]
-    now = _differences(image, place[usable])
-    across = parts.transpose(0, 2, 1)
-    normal = across @ parts + _MIXED.noise**2 * parts.shape[1] * np.eye(3)
-    shares = np.linalg.solve(normal, across @ now[:, :, None])[:, :, 0]
+    normal = products[:, :3] + _MIXED.noise**2 * _DIFFERENCES * np.eye(3)
+    shares = np.linalg.solve(normal, products[:, 3, :, None])[:, :, 0]
     of_before = shares[:, 1]
     middle = median(of_before)
     # of the median of normal errors, by their median deviation
@@ -170,14 +202,52 @@ def _places(
     return np.rint(at).astype(np.int64), np.rint(at - moved[far]).astype(np.int64)
 
 
-def _differences(image: Image, place: IntArray) -> FloatArray:
-    """Differences (N, K) of gray levels along rows and columns in patches about pixels (N, 2)."""
-    offset = np.arange(-_MIXED.radius_px, _MIXED.radius_px + 1)
-    rows = (place[:, 1, None] + offset)[:, :, None]
-    columns = (place[:, 0, None] + offset)[:, None, :]
-    patch = image[rows, columns].astype(np.float64)
-    step = _MIXED.step_px
-    inner = slice(step, -step)
-    along = patch[:, inner, 2 * step :] - patch[:, inner, : -2 * step]
-    down = patch[:, 2 * step :, inner] - patch[:, : -2 * step, inner]
-    return np.concatenate([along, down], axis=1).reshape(len(place), -1)
+@compiled
+def _products(
+    images: tuple[Image, Image, Image], place: IntArray, source: IntArray, products: FloatArray
+) -> None:
+    """Write what fits the last of three images in patches about pixels (N, 2).
+
+    Args:
+        images: of three frames, (H, W), the newest one last.
+        place: pixels of features in the frame before.
+        source: pixels in that frame of what has come to these since.
+        products: (N, 4, 3), sums of products of differences of gray levels in a patch: in each row, of
+            what has come there, of the frame before, of the one before that, and of the newest
+            image, with the first three.
+    """
+    first, last, newest = images
+    parts = np.empty((4, _DIFFERENCES))
+    for n in range(len(place)):
+        u, v = place[n]
+        _differences(last, source[n, 0], source[n, 1], parts[0])
+        _differences(last, u, v, parts[1])
+        _differences(first, u, v, parts[2])
+        _differences(newest, u, v, parts[3])
+        for i in range(4):
+            for j in range(min(i + 1, 3)):
+                products[n, i, j] = _product(parts[i], parts[j])
+                if i < 3:
+                    products[n, j, i] = products[n, i, j]
+
+
+@compiled
+def _differences(image: Image, u: int, v: int, differences: FloatArray) -> None:
+    """Write the differences (K,) of gray levels along rows and columns in a patch about a pixel."""
+    k = 0
+    for y in range(v - _INNER_PX, v + _INNER_PX + 1):
+        for x in range(u - _INNER_PX, u + _INNER_PX + 1):
+            along = np.int32(image[y, x + _STEP_PX]) - np.int32(image[y, x - _STEP_PX])
+            down = np.int32(image[y + _STEP_PX, x]) - np.int32(image[y - _STEP_PX, x])
+            differences[k] = along
+            differences[k + 1] = down
+            k += 2
+
+
+@compiled_sums
+def _product(values: FloatArray, others: FloatArray) -> float:
+    """Sum of products of whole numbers: exact, whatever the order."""
+    total = 0.0
+    for k in range(len(values)):
+        total += values[k] * others[k]
+    return total
