@@ -37,6 +37,11 @@ def test_it_ends_after_three_frames_with_enough() -> None:
     assert (begun.frame, ended.frame, ended.ended) == (3, 10, True)
 
 
+def test_frames_without_features_are_a_prediction() -> None:
+    assert _found([100, *[0] * 9, 100]) == []
+    assert [f.frame for f in _found([100, 10, 0, 10, 0, 10])] == [5]
+
+
 def test_the_first_frame_and_a_motion_sensor_need_none() -> None:
     assert _found([0, 0, 10, 10, 10]) == []
     assert _found([100, *[10] * 9], measured=True) == []

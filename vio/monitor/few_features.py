@@ -40,6 +40,8 @@ class FewFeatures:
 
     def frame(self, index: int, report: UpdateReport, *, measured: bool) -> list[Finding]:
         """Return what a frame shows; `measured`: whether a motion sensor carries the pose."""
+        if report.used == 0:
+            return []  # of a prediction, the covariance tells
         few = report.used < _FEW.least and not measured
         self._begun = self._begun or not few
         if not self._begun or few == self._few:
