@@ -81,6 +81,15 @@ def _behind_dirt(exposures: Exposures, k: int) -> FloatArray:
 STEPS_PX = np.random.default_rng(3).integers(6, 14, 60).tolist()
 
 
+@pytest.mark.parametrize(("rows", "found"), [(1, False), (3, True)])
+def test_few_moving_features_are_of_one_near_thing(
+    monkeypatch: pytest.MonkeyPatch, rows: int, found: bool
+) -> None:
+    """13 features in view, and 39."""
+    monkeypatch.setitem(globals(), "CORNERS", CORNERS[:rows])
+    assert bool(_found(_blended, STEPS_PX)) == found
+
+
 @pytest.mark.parametrize(
     ("mix", "lost"),
     [(_blended, ()), (_every_second, ()), (_filtered, ()), (_every_second, (14, 16, 18, 20))],

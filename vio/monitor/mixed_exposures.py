@@ -33,7 +33,8 @@ class _MixedRules(NamedTuple):
     min_moved_px: float = 5.0
     min_gradient: float = 6.0  # gray levels, root mean square of a patch's differences
     noise: float = 2.0  # of differences, gray levels
-    min_features: int = 10
+    # of a frame that tells: fewer are of one near thing, as 10 to 18 in healthy renders were
+    min_features: int = 25
     sigmas: float = 3.0  # that the share is beyond what it may be by chance
     most_features: Capacity[int] = 50
     # Share of the frame before in an image, which it has at least.
