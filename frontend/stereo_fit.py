@@ -261,9 +261,8 @@ class StereoFit:
 
         Rows may be far apart where the right camera has been pitched since it was calibrated.
         """
-        most = max(
-            ROW_SEARCH.max_rows_half, abs(offset)
-        )  # learned rows may go on beyond the search
+        # learned rows may lie beyond those that are searched
+        most = max(ROW_SEARCH.max_rows_half, abs(offset))
         tried = range(-most, most + 1)
         counts = [
             self.count_on_rows(left_half, shifted_rows(right_half, rows), points) for rows in tried

@@ -54,8 +54,9 @@ def add_parser(commands: Any) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    if args.to == "tum" or _is_trajectory(Path(args.source)):
-        return _trajectory(args)
+    holds_poses = _is_trajectory(Path(args.source))
+    if args.to == "tum" or holds_poses:
+        return _trajectory(args, holds_poses=holds_poses)
     return _recording(args)
 
 
@@ -78,8 +79,8 @@ def _is_trajectory(path: Path) -> bool:
     return True
 
 
-def _trajectory(args: argparse.Namespace) -> int:
-    """Write a trajectory, or the ground truth of a recording."""
+def _trajectory(args: argparse.Namespace, *, holds_poses: bool) -> int:
+    """Write a trajectory, or the ground truth of a recording, which holds more than poses."""
     from vio.datasets import open_dataset
     from vio.files.atomic import check_new_file
     from vio.offline.convert_trajectory import convert_trajectory, write_reference
@@ -91,7 +92,7 @@ def _trajectory(args: argparse.Namespace) -> int:
             "--start and --end choose frames of a recording to convert, not poses; leave them out"
         )
     check_new_file(args.out)
-    if not _is_trajectory(source):
+    if not holds_poses:
         written = write_reference(open_dataset(args.source, config.dataset), args.out)
     elif args.to in _TRAJECTORIES:
         calibration = config.dataset.calibration

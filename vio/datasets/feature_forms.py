@@ -65,8 +65,9 @@ def without_placeholders(tracks: FeatureTracks) -> tuple[FeatureTracks, str | No
 
     These are pixels that are no numbers, pairs at or below zero that several rows share to the
     last bit, as -1 -1, and the left pixel itself, to the last bit, in several rows: not where it is
-    a whole one, or a part of it, and so is the right one of a far point. Where a matcher searches no
-    farther than a whole number of pixels, and gives what is nearer that disparity, these are none.
+    a whole one, or a part of it, and so is the right one of a far point. Where a matcher searches
+    no farther than a whole number of pixels, and gives what is nearer that disparity, these are
+    none.
     """
     right = tracks.z[:, 2:]
     empty = np.isnan(right).any(axis=1)
@@ -96,8 +97,8 @@ def without_placeholders(tracks: FeatureTracks) -> tuple[FeatureTracks, str | No
 
 
 def _capped(tracks: FeatureTracks) -> tuple[BoolArray, float, float]:
-    """Return which rows (R,) have the largest disparity of all, a whole number of pixels, where it is
-    that of many more than are just below it; that disparity, px, and their share.
+    """Return which rows (R,) have the largest disparity of all, a whole number of pixels, where it
+    is that of many more than are just below it; that disparity, px, and their share.
     """
     disparity = tracks.z[:, 0] - tracks.z[:, 2]
     known = disparity[tracks.has_right & np.isfinite(disparity)]
@@ -114,7 +115,7 @@ def _capped(tracks: FeatureTracks) -> tuple[BoolArray, float, float]:
     is_cap &= share >= _RULES.capped
     if not is_cap or top < known.max() - _RULES.same_px or at_top < _RULES.crowded * below:
         return none, 0.0, 0.0
-    return np.abs(disparity - top) <= _RULES.same_px, top, share
+    return is_top, top, share
 
 
 def features_fault(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
@@ -146,8 +147,8 @@ def features_fault(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
 
 def features_doubt(camera: StereoCamera, tracks: FeatureTracks) -> str | None:
     """Return a note where pixels and principal point look like those of images of two sizes
-    (features go far beyond an image of no stated size), or most disparities like those at the end of a
-    matcher's search.
+    (features go far beyond an image of no stated size), or most disparities like those at the end
+    of a matcher's search.
     """
     capped, largest, share = _capped(tracks)
     if capped.any() and share > _RULES.of_a_plane:

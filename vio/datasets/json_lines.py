@@ -1,7 +1,8 @@
 """The IMU in a file of JSON Lines, one object a line.
 
-Spectacular AI's `data.jsonl` has `{"sensor": {"type": "gyroscope", "values": [x, y, z]}, "time": s}`
-(rad/s; m/s^2 of the `accelerometer`) among other lines; cuVSLAM's `IMU.jsonl` (EDEX) lists both
+Spectacular AI's `data.jsonl` has
+`{"sensor": {"type": "gyroscope", "values": [x, y, z]}, "time": s}` (rad/s; m/s^2 of the
+`accelerometer`) among other lines; cuVSLAM's `IMU.jsonl` (EDEX) lists both
 sensors by name beside a `timestamp`.
 
 Reference: Spectacular AI, "Data format", and the tools of cuVSLAM for EDEX.
@@ -54,13 +55,14 @@ def read_imu_lines(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
     gyro = _of_sensor(path, [r for r in readings if r.sensor == "w"], "gyro", found)
     accel = _of_sensor(path, [r for r in readings if r.sensor == "a"], "accelerometer", found)
     notes = dict.fromkeys(found)  # the unit of the times is that of both
+    record: ImuRecord | None
     if np.array_equal(gyro[0], accel[0]):
         record = ImuRecord(gyro[0], gyro[1], accel[1])
-        return record, (*notes, *sampling_notes(record, str(path)))
-    joined = joined_record(gyro, accel)
-    if joined is None:
+    else:
+        record = joined_record(gyro, accel)
+    if record is None:
         raise DataError(f"{path}: no time of the gyro lies between those of the accelerometer")
-    return joined, (*notes, *sampling_notes(joined, str(path)))
+    return record, (*notes, *sampling_notes(record, str(path)))
 
 
 def _readings(path: Path, notes: list[str]) -> Iterator[_Reading]:

@@ -1,9 +1,9 @@
 """Whether so few features carry the motion that nothing tells the scene from what moves on its own.
 
-Before a blank wall, in the dark or in fog a handful of features is left. A person that walks by then
-has as many, fits a motion as well as the scene does, and no consensus, vote or gate can tell. With a
-motion sensor the prediction does. By images alone the motion of such frames may be that of the person.
-ORB-SLAM3 takes a frame with fewer than 30 matches of its map for lost.
+Before a blank wall, in the dark or in fog a handful of features is left. A person that walks by
+then has as many, fits a motion as well as the scene does, and no consensus, vote or gate can tell.
+With a motion sensor the prediction does. By images alone the motion of such frames may be that of
+the person. ORB-SLAM3 takes a frame with fewer than 30 matches of its map for lost.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from vio.records import UpdateReport
 class _FewRules(NamedTuple):
     """When features are few."""
 
-    # In rendered and real recordings of all rigs, three frames in a row have 46 and more. Before a blank
-    # wall with people 10 to 23, and a motion off by 4 degrees that is stated to 0.9.
+    # In rendered and real recordings of all rigs, three frames in a row have 46 and more. Before a
+    # blank wall with people 10 to 23, and a motion off by 4 degrees that is stated to 0.9.
     least: int = 25
     frames: int = 3  # in a row
 
@@ -32,9 +32,7 @@ class FewFeatures:
 
     def __init__(self) -> None:
         self._begun = False  # whether there have been enough
-        self._since: int | None = (
-            None  # first frame of those in a row with few, or with enough again
-        )
+        self._since = 0  # first frame of those in a row with few, or with enough again
         self._count = 0  # of these
         self._few = False  # as it was reported
 
