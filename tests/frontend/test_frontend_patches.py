@@ -326,7 +326,9 @@ def test_chance_matches_do_not_make_the_search_reach_further() -> None:
 
 
 def test_a_near_scene_with_repeated_texture_does_not_look_exchanged() -> None:
-    """Each point has a match to the left, beyond the usual reach, and one to the right within it."""
+    """Each point has a match to the left, beyond the usual reach, and one to the right within
+    it.
+    """
     near, again = _moved_right(120.0).full, _moved_right(-15.0).full
     right = np.where(np.arange(300) < 150, near, again)
     views, points = [half_image(i) for i in (PLAIN, right)], POINTS[POINTS[:, 0] > 170]

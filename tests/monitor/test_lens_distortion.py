@@ -130,9 +130,9 @@ def test_errors_that_features_keep_are_no_distortion(features: int, leave: float
 
 
 def test_the_standard_error_covers_errors_that_a_part_of_the_image_shares() -> None:
-    """Rows of near things, of a twentieth of the image each, are off by 0.6 px in common, as at rims
-    and in textures that repeat, by other features in each frame: errors of 30 rigs over what is stated
-    of them. By features alone they come to 3.9.
+    """Rows of near things, of a twentieth of the image each, are off by 0.6 px in common, as at
+    rims and in textures that repeat, by other features in each frame: errors of 30 rigs over what
+    is stated of them. By features alone they come to 3.9.
     """
     over = []
     for seed in range(30):

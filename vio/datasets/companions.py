@@ -316,8 +316,8 @@ def _read_motion(
 def _read_logged(
     layout: Layout, rig: Rig, times_ns: IntArray, timed: bool
 ) -> tuple[MotionSamples[MotionSample], list[Path], list[str]]:
-    """Read the IMU of a data set or an SDK, as `_read_motion`; where that is not possible, the images
-    are used alone, with a note.
+    """Read the IMU of a data set or an SDK, as `_read_motion`; where that is not possible, the
+    images are used alone, with a note.
     """
     file = _first_file((layout.root, layout.base), _LOGGED_IMU_FILES)
     if file is None:

@@ -22,7 +22,9 @@ _OBJECTS = ("opaque", "object")  # classes of what only MATLAB itself can read
 
 
 def holds_object(path: Path) -> bool:
-    """Return whether a MATLAB file that can be read holds an object, maybe beside other variables."""
+    """Return whether a MATLAB file that can be read holds an object, maybe beside other
+    variables.
+    """
     from scipy.io import whosmat
 
     return any(kind in _OBJECTS for _, _, kind in whosmat(path))

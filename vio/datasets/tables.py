@@ -572,8 +572,8 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
 
 def _known_header(table: NumberTable) -> tuple[str, ...]:
     """Return the names of the columns of a table without a header: of messages `sensor_msgs/Imu` as
-    `ros2 topic echo --csv` writes them, which begin with seconds, nanoseconds and the name of a frame,
-    or of a data set's, by the name of its file; empty: not known.
+    `ros2 topic echo --csv` writes them, which begin with seconds, nanoseconds and the name of a
+    frame, or of a data set's, by the name of its file; empty: not known.
     """
     count = 1 + table.values.shape[1]
     name = table.path.name.lower()

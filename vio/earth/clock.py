@@ -1,7 +1,7 @@
 """Whether GNSS positions fit a trajectory much better at other times: their clock is another one.
 
-A constant error of the stamps moves positions along the path, as far as the speed is constant; where
-the speed or the direction changes, it deforms the path, which no placing of it explains.
+A constant error of the stamps moves positions along the path, as far as the speed is constant;
+where the speed or the direction changes, it deforms the path, which no placing of it explains.
 """
 
 from __future__ import annotations

@@ -76,8 +76,8 @@ _OF_FRAMES = re.compile(r"([tpq][xyzw])_[a-z]+_[a-z]+")
 # whole seconds of a stamp, and the rest of it in the next column, as header.stamp.sec has them
 _SECONDS = re.compile(r"(.*?)(?:secs?|seconds?)")
 _NANOSECONDS = re.compile(r"(.*?)(?:n|nano)(?:secs?|seconds?)")
-# the groups of OpenVINS's state: the quaternion, JPL's from the world to the IMU, is Hamilton's from
-# the IMU to the world in numbers
+# the groups of OpenVINS's state: the quaternion, JPL's from the world to the IMU, is Hamilton's
+# from the IMU to the world in numbers
 _STATE = re.compile(r"timestamp\(s\) q p v bg ba\b")
 _STATE_COLUMNS = 17  # of the time and these
 _SPELT = re.compile(r"\b(?:w[ ,]*x[ ,]*y[ ,]*z|x[ ,]*y[ ,]*z[ ,]*w)\b", re.IGNORECASE)

@@ -62,9 +62,9 @@ def are_matrix_files(folder: Path) -> bool:
 
 
 def matrices_of_files(folder: Path) -> tuple[list[str], list[str]]:
-    """Return the poses of a folder of files with one matrix each, as rows of 12 or 16 numbers, and the
-    number in the name of each, in their order. Those that are not finite, as where a scanner was lost,
-    are left out.
+    """Return the poses of a folder of files with one matrix each, as rows of 12 or 16 numbers, and
+    the number in the name of each, in their order. Those that are not finite, as where a scanner
+    was lost, are left out.
 
     Raises:
         DataError: the folder holds none, or a file is no single pose.

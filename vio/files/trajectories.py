@@ -134,11 +134,11 @@ def read_trajectory(
 ) -> Trajectory:
     """Read a trajectory; the format is detected from the content unless given.
 
-    A KITTI file describes cam0 and has no times, as do TartanAir's (a position and a quaternion a row, of
-    axes forward, right and down), and matrices over four lines or in a file each, numbered in its
-    name; KITTI-360's have the number of the frame (or a time) before 12 numbers of the IMU's pose, or
-    16 of cam0's; an EuRoC file describes the IMU; a TUM file describes the frame of its comment
-    `# body: imu` or `# body: cam0`, else the IMU. `body`
+    A KITTI file describes cam0 and has no times, as do TartanAir's (a position and a quaternion a
+    row, of axes forward, right and down), and matrices over four lines or in a file each, numbered
+    in its name; KITTI-360's have the number of the frame (or a time) before 12 numbers of the IMU's
+    pose, or 16 of cam0's; an EuRoC file describes the IMU; a TUM file describes the frame of its
+    comment `# body: imu` or `# body: cam0`, else the IMU. `body`
     overrides all of these. A header may name the columns, in any order and among others, and the
     unit of the stamps. Where it does not, a quaternion has w first between commas and last between
     white space, which `Trajectory.orientations` says; quaternions of zeros, and files with four
@@ -183,8 +183,8 @@ def read_trajectory(
 
 
 def _of_files(folder: Path, body: BodyFrame | None) -> Trajectory:
-    """Return the poses of a folder of files with one matrix each; the numbers in their names are those
-    of frames, or times.
+    """Return the poses of a folder of files with one matrix each; the numbers in their names are
+    those of frames, or times.
     """
     rows, names = matrices_of_files(folder)
     table = _Table(folder, [], rows, list(range(1, len(rows) + 1)), None)
@@ -195,8 +195,9 @@ def _of_files(folder: Path, body: BodyFrame | None) -> Trajectory:
 
 
 def _untimed_columns(table: _Table, named: PoseColumns | None) -> PoseColumns | None:
-    """Return the columns of a position and a quaternion that have no time, by their header, or by the
-    norm of the quaternions where there are seven columns; None: there is a time, or no such pose.
+    """Return the columns of a position and a quaternion that have no time, by their header, or by
+    the norm of the quaternions where there are seven columns; None: there is a time, or no such
+    pose.
     """
     if named is not None:
         of_pose = (*named.position, *(named.quaternion or ()))

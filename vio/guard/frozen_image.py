@@ -1,8 +1,8 @@
 """A camera of the pair that is frozen, dark or covered, by the images themselves.
 
-An image that stays the same, up to noise, while the other camera's changes is frozen. A left one has
-changed just before, too: at a standstill it stays the same, and what covers the right one changes
-that.
+An image that stays the same, up to noise, while the other camera's changes is frozen. A left one
+has changed just before, too: at a standstill it stays the same, and what covers the right one
+changes that.
 """
 
 from __future__ import annotations

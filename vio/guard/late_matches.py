@@ -21,9 +21,9 @@ class LateMatches(MatchCheck):
     """Takes the delay of the right camera out of its pixels, at first order.
 
     A recording of features whose right pixels are a whole frame late or early from the start is
-    paired anew instead, by the finding `pairs-shifted`. The rows of late ones differ by the motion in
-    the last frame, those of early ones by that in the next: the two are learned apart, as points that
-    come near move more from frame to frame.
+    paired anew instead, by the finding `pairs-shifted`. The rows of late ones differ by the motion
+    in the last frame, those of early ones by that in the next: the two are learned apart, as points
+    that come near move more from frame to frame.
     """
 
     def __init__(self, camera: StereoCamera) -> None:

@@ -99,8 +99,8 @@ def recorded_source(dataset: Dataset, config: Config) -> Source:
 
 
 def refuse_other_types(config: Config, **given: object) -> None:
-    """Raise TypeError, with the call that makes the right one, where a program gives something else,
-    such as a path, a dictionary, or a recording in the place of its camera.
+    """Raise TypeError, with the call that makes the right one, where a program gives something
+    else, such as a path, a dictionary, or a recording in the place of its camera.
 
     Args:
         config: settings.

@@ -28,9 +28,9 @@ class _LensRules(NamedTuple):
     # frames with matches, after which it is asked
     looked_at: tuple[int, ...] = (20, 40, 80, 160)
     most: int = 10  # whose matches are kept, spread over all so far
-    # Of features, each of which is left out once: all matches of a feature have its error, which none
-    # of them shows. So are cells of the image, along u and v: features at the rim of a near thing, and
-    # those of a texture that repeats, have errors in common.
+    # Of features, each of which is left out once: all matches of a feature have its error, which
+    # none of them shows. So are cells of the image, along u and v: features at the rim of a near
+    # thing, and those of a texture that repeats, have errors in common.
     blocks: Tolerance[int] = 10
     cells: tuple[int, int] = (4, 3)
     min_features: int = 100

@@ -43,8 +43,8 @@ class _MixedRules(NamedTuple):
     frames: int = 6  # the newest that tell, of which …
     mixed: int = 2  # … so many have it before it is reported
     clear_frames: int = 20  # in a row that do not, before it is over
-    # After so many frames that tell, and while none of the newest has it, two in a row of so many are
-    # looked at: every second frame may be a blend. A prime, so that no other pattern is missed.
+    # After so many frames that tell, and while none of the newest has it, two in a row of so many
+    # are looked at: every second frame may be a blend. A prime, so that no other pattern is missed.
     first_frames: int = 20
     period: int = 7
 
@@ -148,8 +148,8 @@ class MixedExposures:
 
 
 def _share_of_before(seen: list[Observations], images: list[Image]) -> tuple[float, float] | None:
-    """The share of the frame before in an image, beyond that of the one before it, and what it is at
-    least; None: too few features tell.
+    """The share of the frame before in an image, beyond that of the one before it, and what it is
+    at least; None: too few features tell.
 
     Args:
         seen: features of the last three frames, the newest one last.
@@ -191,7 +191,8 @@ def _places(
     """Pixels (N, 2) of features in the frame before, and of what has come there since, as their
     neighbours move as they do.
 
-    Features that are lost, as two exposures may lose them, have moved as from frame to frame before.
+    Features that are lost, as two exposures may lose them, have moved as from frame to frame
+    before.
     """
     moved = np.zeros((len(before), 2))
     old, new = shared_rows(earlier.ids, before.ids)
@@ -213,8 +214,8 @@ def _products(
         images: of three frames, (H, W), the newest one last.
         place: pixels of features in the frame before.
         source: pixels in that frame of what has come to these since.
-        products: (N, 4, 3), sums of products of differences of gray levels in a patch: in each row, of
-            what has come there, of the frame before, of the one before that, and of the newest
+        products: (N, 4, 3), sums of products of differences of gray levels in a patch: in each row,
+            of what has come there, of the frame before, of the one before that, and of the newest
             image, with the first three.
     """
     first, last, newest = images

@@ -26,8 +26,8 @@ class _TwistRules(NamedTuple):
 
     tracks_per_frame: int = 80  # tracks of a frame that the camera's motion is computed from
     min_links: int = 15  # tracks between two frames
-    # Between the frames that are compared: from one to the next of a fast camera, the errors of pixels
-    # are as large as a slow motion. Up to 30 frames/s every frame counts.
+    # Between the frames that are compared: from one to the next of a fast camera, the errors of
+    # pixels are as large as a slow motion. Up to 30 frames/s every frame counts.
     min_interval_s: float = 0.03
     max_interval_s: float = 0.25
     same_s: Tolerance[float] = 1e-6  # intervals whose end and start differ by less are contiguous
@@ -62,7 +62,9 @@ class CameraTwists:
         self.spacing = 1  # of the frames that count, in frames
 
     def frame(self, seen: Observations) -> Intervals | None:
-        """Add one frame; every `BATCH` frames that count, return the motions since the last batch."""
+        """Add one frame; every `BATCH` frames that count, return the motions since the last
+        batch.
+        """
         self._passed += 1
         if self._kept and self._is_soon(seen.time_ns - self._kept[-1].time_ns):
             return None
