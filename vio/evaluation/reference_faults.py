@@ -258,7 +258,7 @@ def _beside_arm(
     for _ in range(_FAULT.fits):
         turned = s * np.einsum("ij,mj->mi", R, T_est[:, :3, 3] + T_est[:, :3, :3] @ lever)
         error = y - turned - t
-        columns = [-np.array([so3_hat(p) for p in turned]), np.tile(np.eye(3), (len(y), 1, 1))]
+        columns = [-so3_hat(turned), np.tile(np.eye(3), (len(y), 1, 1))]
         if scaled:
             columns.append(turned[:, :, None])
         if arm:

@@ -10,8 +10,9 @@ Reference: Serra, Image analysis and mathematical morphology (1982), for opening
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.guard.image_check import FrameImages, ImageCheck
-from vio.numerics.compiled import compiled
+from vio.numerics.compiled import compiled_sums
 from vio.numerics.kinds import Capacity
 from vio.numerics.robust import median
 from vio.records import NS_PER_S, Image
@@ -41,7 +42,8 @@ class _DotRules(NamedTuple):
     moved_correlation: float = 0.3
     signs: int = 3  # such comparisons among …
     newest: int = 10  # … the newest ones
-    coarse_sigma_px: float = 3.0  # of the half image
+    coarse_px: Capacity[int] = 4  # of the half image, averaged first
+    coarse_sigma_px: float = 3.0  # of the half image, with that average
     rows: Capacity[int] = 6  # of blocks
     columns: Capacity[int] = 8
     # of the opening: a dot is smaller than 5 px, in images over 1000 px wide than 7
@@ -51,6 +53,11 @@ class _DotRules(NamedTuple):
 
 _DOTS = _DotRules()
 _CODE = "projected-dots"
+# pixels of the averaged image: an average over n of them has a variance of (n^2 - 1) / 12
+_COARSE_SIGMA = (
+    math.sqrt(_DOTS.coarse_sigma_px**2 - (_DOTS.coarse_px**2 - 1) / 12) / _DOTS.coarse_px
+)
+_Parts: TypeAlias = tuple[Image, Image, Image]
 _SMALL = np.ones((3, 3), dtype=np.uint8)  # pixels of the half image
 
 
@@ -59,7 +66,7 @@ class ProjectedDots(ImageCheck):
 
     def __init__(self) -> None:
         super().__init__()
-        self._last: tuple[int, Image] | None = None  # time and parts of an image
+        self._last: tuple[int, _Parts] | None = None  # time and parts of an image
         # comparisons: the frame, and whether it shows dots
         self._signs = deque[tuple[int, bool]](maxlen=_DOTS.newest)
         self._active = False  # there are dots
@@ -90,9 +97,11 @@ class ProjectedDots(ImageCheck):
         last = self._last
         parts = _parts(images.halves[0])
         self._last = time_ns, parts
-        if last is None or elapsed_s > _DOTS.max_s or last[1].shape != parts.shape:
+        if last is None or elapsed_s > _DOTS.max_s or last[1][0].shape != parts[0].shape:
             return
-        bright, dark, coarse = (median(part) for part in _correlations(last[1], parts))
+        bright, dark, coarse = (
+            median(_correlations(before, now)) for before, now in zip(last[1], parts, strict=True)
+        )
         is_sign = bright >= _DOTS.min_correlation and bright - max(dark, coarse) >= _DOTS.min_excess
         if not is_sign and coarse < _DOTS.moved_correlation:
             self._since = images.index
@@ -120,45 +129,59 @@ def without_dots(image: Image) -> Image:
     return np.asarray(cv2.morphologyEx(image, cv2.MORPH_OPEN, element), dtype=np.uint8)
 
 
-def _parts(half: Image) -> Image:
-    """Small bright spots, small dark ones and the coarse image (3, H, W) of an image at half
-    resolution, of which rows and columns beyond whole blocks are left out.
+def _parts(half: Image) -> _Parts:
+    """Small bright spots (H, W), small dark ones and the coarse image (H / 4, W / 4) of an image at
+    half resolution.
     """
     height, width = half.shape
-    seen = half[: height - height % _DOTS.rows, : width - width % _DOTS.columns]
-    out: Image = np.empty((3, *seen.shape), dtype=np.uint8)
-    out[0] = cv2.morphologyEx(seen, cv2.MORPH_TOPHAT, _SMALL)
-    out[1] = cv2.morphologyEx(seen, cv2.MORPH_BLACKHAT, _SMALL)
-    out[2] = cv2.GaussianBlur(seen, (0, 0), _DOTS.coarse_sigma_px)
-    return out
+    size = max(width // _DOTS.coarse_px, _DOTS.columns), max(height // _DOTS.coarse_px, _DOTS.rows)
+    averaged = cv2.resize(half, size, interpolation=cv2.INTER_AREA)
+    parts = (
+        cv2.morphologyEx(half, cv2.MORPH_TOPHAT, _SMALL),
+        cv2.morphologyEx(half, cv2.MORPH_BLACKHAT, _SMALL),
+        cv2.GaussianBlur(averaged, (0, 0), _COARSE_SIGMA),
+    )
+    bright, dark, coarse = (np.asarray(part, dtype=np.uint8) for part in parts)
+    return bright, dark, coarse
 
 
 def _correlations(before: Image, now: Image) -> FloatArray:
-    """Correlations (3, B) of two images' parts (3, H, W) in each block; 0 where one is uniform."""
-    out: FloatArray = np.empty((len(now), _DOTS.rows * _DOTS.columns))
+    """Correlations (B,) of two images (H, W) in each block; 0 where one is uniform.
+
+    Rows and columns beyond whole blocks are left out.
+    """
+    out: FloatArray = np.empty(_DOTS.rows * _DOTS.columns)
     _correlate(before, now, _DOTS.rows, _DOTS.columns, out)
     return out
 
 
-@compiled
+@compiled_sums
 def _correlate(before: Image, now: Image, rows: int, columns: int, out: FloatArray) -> None:
-    parts, height, width = now.shape
+    height, width = now.shape
     high = height // rows
     wide = width // columns
-    count = high * wide
-    for part in range(parts):
-        for block in range(rows * columns):
-            v = block // columns * high
-            u = block % columns * wide
-            a = b = aa = bb = ab = np.int64(0)
-            for i in range(v, v + high):
-                for j in range(u, u + wide):
-                    x = np.int64(before[part, i, j])
-                    y = np.int64(now[part, i, j])
-                    a += x
-                    b += y
-                    aa += x * x
-                    bb += y * y
-                    ab += x * y
-            spread = float(count * aa - a * a) * float(count * bb - b * b)
-            out[part, block] = (count * ab - a * b) / np.sqrt(spread) if spread > 0.0 else 0.0
+    count = float(high * wide)
+    for block in range(rows * columns):
+        v = block // columns * high
+        u = block % columns * wide
+        a = b = aa = bb = ab = 0.0
+        for i in range(v, v + high):
+            # whole numbers that single precision holds exactly, over a row of a block
+            row_a = row_b = row_aa = row_bb = row_ab = np.float32(0.0)
+            of_before = before[i, u : u + wide]
+            of_now = now[i, u : u + wide]
+            for j in range(wide):
+                x = np.float32(of_before[j])
+                y = np.float32(of_now[j])
+                row_a += x
+                row_b += y
+                row_aa += x * x
+                row_bb += y * y
+                row_ab += x * y
+            a += row_a
+            b += row_b
+            aa += row_aa
+            bb += row_bb
+            ab += row_ab
+        spread = (count * aa - a * a) * (count * bb - b * b)
+        out[block] = (count * ab - a * b) / np.sqrt(spread) if spread > 0.0 else 0.0
