@@ -27,7 +27,8 @@ def _build_klt(
 def _build_orb(
     camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None
 ) -> Frontend:
-    from vio.frontend.descriptors import DescriptorFrontend, MutualNearest, orb_extractor
+    from vio.frontend.descriptors import DescriptorFrontend
+    from vio.frontend.keypoints import MutualNearest, orb_extractor
 
     return DescriptorFrontend(
         camera, settings, "orb", orb_extractor(settings.match), MutualNearest()
@@ -37,7 +38,8 @@ def _build_orb(
 def _build_sift(
     camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None
 ) -> Frontend:
-    from vio.frontend.descriptors import DescriptorFrontend, MutualNearest, sift_extractor
+    from vio.frontend.descriptors import DescriptorFrontend
+    from vio.frontend.keypoints import MutualNearest, sift_extractor
 
     return DescriptorFrontend(
         camera, settings, "sift", sift_extractor(settings.match), MutualNearest()
@@ -74,7 +76,6 @@ BUILDERS: dict[str, Callable[[StereoCamera, FrontendSettings, Dataset | None], F
     "kornia": _build_kornia,
     "precomputed": _build_precomputed,
 }
-_ONE_CAMERA = ("klt", "precomputed")
 
 
 @contextmanager
@@ -117,10 +118,5 @@ def build_frontend(
         raise ConfigError(
             f"frontend.name: there is no front end {name!r}; choose one of auto, "
             f"{', '.join(BUILDERS)}"
-        )
-    if camera.kind != "stereo" and name not in _ONE_CAMERA:
-        raise ConfigError(
-            f"frontend.name: {name} needs a stereo pair; one camera takes "
-            f"{' or '.join(_ONE_CAMERA)}"
         )
     return BUILDERS[name](camera, settings, dataset)

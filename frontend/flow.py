@@ -4,7 +4,7 @@ pixels are of the full image.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.frontend.patches import ImageLevels, inside, mean_and_contrast
 from vio.frontend.prediction import guessed_pixels
-from vio.frontend.tracks import ANCHOR_REACH_PX, PreviousFrame
+from vio.frontend.tracks import ANCHOR_REACH_PX, PreviousFrame, Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
@@ -52,29 +52,64 @@ class _TrackingRules(NamedTuple):
 _TRACKING = _TrackingRules()
 
 
-def follow(
-    camera: StereoCamera,
-    previous: PreviousFrame,
-    image: ImageLevels,
-    prior: TrackPrior | None,
-    expected: FloatArray,
-    levels: int,
-) -> tuple[FloatArray, BoolArray]:
-    """Return the pixels (N, 2) of the previous frame's features in the left image, and a mask (N,)
-    of those found.
-
-    Args:
-        camera: the rectified pair.
-        previous: the previous frame, N features.
-        image: the current left image.
-        prior: usable prior, or None.
-        expected: motion (4, 4) `T_curr_prev` by the last one.
-        levels: pyramid levels above half resolution.
+class Flow(Protocol):
+    """How the features of a frame are followed into the left image of the next one, and where new
+    ones may be found.
     """
-    old = previous.tracks
-    guess = guessed_pixels(camera, old, prior, expected, image.full)
-    trusted = prior is not None or previous.trusted
-    return track_with_retries(previous.left.half, image, old.left, guess, trusted, levels)
+
+    def see(self, image: Image) -> bool:
+        """Take the left image (H, W) of a frame, before features are followed into it or found;
+        return whether that has cost a stage of its own.
+        """
+
+    def follow(
+        self,
+        previous: PreviousFrame,
+        image: ImageLevels,
+        prior: TrackPrior | None,
+        expected: FloatArray,
+    ) -> tuple[FloatArray, BoolArray]:
+        """Return the pixels (N, 2) of the previous frame's features in the left image, and a mask
+        (N,) of those found.
+
+        Args:
+            previous: the previous frame, N features.
+            image: the current left image.
+            prior: usable prior, or None.
+            expected: motion (4, 4) `T_curr_prev` by the last one.
+        """
+
+    def keep(self, tracks: Tracks) -> None:
+        """Take the features after a frame, with new ones."""
+
+
+class LucasKanade:
+    """Follows features by forward-backward Lucas-Kanade."""
+
+    def __init__(self, camera: StereoCamera, levels: int) -> None:
+        """Prepare, with the pyramid levels above half resolution."""
+        self._camera = camera
+        self._levels = levels
+
+    def see(self, image: Image) -> bool:
+        """Nothing is asked of an image beforehand."""
+        return False
+
+    def follow(
+        self,
+        previous: PreviousFrame,
+        image: ImageLevels,
+        prior: TrackPrior | None,
+        expected: FloatArray,
+    ) -> tuple[FloatArray, BoolArray]:
+        """Return pixels (N, 2) of features and a mask (N,) of those found; see `Flow`."""
+        old = previous.tracks
+        guess = guessed_pixels(self._camera, old, prior, expected, image.full)
+        trusted = prior is not None or previous.trusted
+        return track_with_retries(previous.left.half, image, old.left, guess, trusted, self._levels)
+
+    def keep(self, tracks: Tracks) -> None:
+        """Nothing is kept of features."""
 
 
 def track_with_retries(

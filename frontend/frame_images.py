@@ -1,4 +1,4 @@
-"""The images of a frame as the front end `klt` uses them: checked, equalised, paired by time, at
+"""The images of a frame as front ends use them that follow features: checked, equalised, paired by time, at
 two resolutions.
 """
 
@@ -41,8 +41,11 @@ class ImagePreparation:
         settings: FrontendSettings,
         bank: AnchorBank,
         right: RightImages,
+        name: str,
     ) -> None:
-        """Prepare; which right image is a frame's is for `right` to say."""
+        """Prepare for the front end of that name; which right image is a frame's is for `right` to
+        say.
+        """
         self._camera = camera
         self._disparity = settings.disparity
         self._bank = bank
@@ -53,7 +56,7 @@ class ImagePreparation:
             self._mask = None
         else:
             self._mask = load_mask(settings.klt.mask)
-        self._validator = FrameValidator(camera, "klt")
+        self._validator = FrameValidator(camera, name)
         # made with the image size of the first frame
         self._setup: tuple[StereoFit, BoolArray | None] | None = None
 

@@ -123,7 +123,7 @@ def motion_across(
         right: the present right image.
         starts: motions (S, 4, 4) to try, beside those of minimal sets of points.
     """
-    from vio.frontend.descriptors import MutualNearest, sift_extractor
+    from vio.frontend.keypoints import MutualNearest, sift_extractor
 
     assert previous.right_half is not None
     camera = problem.camera

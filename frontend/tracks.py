@@ -106,6 +106,11 @@ class AnchorBank:
         """Return a bank with room for the anchors of so many features at a time."""
         return cls(_BANK_FACTOR * count, ANCHOR_RADIUS_PX)
 
+    @property
+    def size(self) -> int:
+        """Number of slots."""
+        return len(self._taken)
+
     def add(self, image: Image, centres: FloatArray) -> IntArray:
         """Cut new anchors around pixels (N, 2) of an image; return their slots (N,)."""
         free = (~self._taken).nonzero()[0][: len(centres)]

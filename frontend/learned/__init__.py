@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from vio.errors import MissingDependencyError, extra_text
-from vio.frontend.descriptors import DescriptorFrontend, Matcher, MutualNearest
+from vio.frontend.descriptors import DescriptorFrontend
+from vio.frontend.keypoints import Matcher, MutualNearest
 from vio.frontend.learned.extractors import build_extractor
 from vio.frontend.learned.lightglue import build_lightglue
 from vio.frontend.learned.weights import pick_device

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from vio.errors import DataError
-from vio.frontend.descriptors import Extractor, Keypoints
+from vio.frontend.keypoints import Extractor, Keypoints
 from vio.frontend.learned.weights import SECTION, Module, filled, half_precision, load_weights
 from vio.frontend.settings import LearnedSettings, MatchSettings
 from vio.records import Image

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from vio.errors import ConfigError, DataError
-from vio.frontend.descriptors import Keypoints, Matcher
+from vio.frontend.keypoints import Keypoints, Matcher
 from vio.frontend.learned.weights import SECTION, half_precision, load_weights
 from vio.frontend.settings import LearnedSettings
 from vio.geometry.stereo import StereoCamera

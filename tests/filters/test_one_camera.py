@@ -267,8 +267,6 @@ def test_one_camera_without_imu_is_refused() -> None:
         build_backend(LEFT, np.eye(4), Config(), None)
     with pytest.raises(ConfigError, match="stereo pair"):
         build_backend(LEFT, T_CAM0_IMU, Config(backend="vislam"), "imu")
-    with pytest.raises(ConfigError, match="stereo pair"):
-        build_frontend("orb", LEFT, FrontendSettings())
 
 
 # --- the front end
@@ -293,9 +291,10 @@ def _walls() -> tuple[tuple[np.ndarray, FloatArray], ...]:
     return tuple(_wall(k) for k in range(4))
 
 
-def test_front_end_tracks_one_camera_without_a_right_image() -> None:
+@pytest.mark.parametrize("name", ["klt", "orb", "sift"])
+def test_front_end_tracks_one_camera_without_a_right_image(name: str) -> None:
     camera = left_alone(WALL_CAMERA)
-    frontend = build_frontend("klt", camera, FrontendSettings())
+    frontend = build_frontend(name, camera, FrontendSettings())
     seen = [
         frontend.process(StereoFrame(k, k * STEP_NS, _walls()[k][0], None)).observations
         for k in range(4)
@@ -309,9 +308,10 @@ def test_front_end_tracks_one_camera_without_a_right_image() -> None:
     assert np.median(np.linalg.norm(seen[3].z[b, :2] - true, axis=1)) < 0.15
 
 
-def test_depth_images_give_right_pixels_and_holes_give_left_only_tracks() -> None:
+@pytest.mark.parametrize("name", ["klt", "orb", "sift"])
+def test_depth_images_give_right_pixels_and_holes_give_left_only_tracks(name: str) -> None:
     camera = with_virtual_baseline(one_camera(300.0, 300.0, 239.5, 149.5, 480, 300), 1.5e-3)
-    frontend = build_frontend("klt", camera, FrontendSettings())
+    frontend = build_frontend(name, camera, FrontendSettings())
     seen = None
     for k in range(3):
         image, depth = _walls()[k]

@@ -16,7 +16,8 @@ import pytest
 from tests.frontend.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
 from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.frontend import descriptors
-from vio.frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
+from vio.frontend.descriptors import DescriptorFrontend
+from vio.frontend.keypoints import Keypoints, MutualNearest
 from vio.frontend.settings import FrontendSettings, GridSettings, LearnedSettings, MatchSettings
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, StereoFrame

@@ -11,9 +11,9 @@ import pytest
 from tests.frontend.test_frontend_scene import CAMERA
 from tests.frontend.test_motion_limits import _fit
 from vio.cameras.projection import camera_args
-from vio.frontend import anchor_fit, descriptors, prediction, stereo_fit, stereo_match
+from vio.frontend import anchor_fit, prediction, stereo_fit, stereo_match
 from vio.frontend.align import on_peak
-from vio.frontend.descriptors import Keypoints, MutualNearest
+from vio.frontend.keypoints import Keypoints, MutualNearest
 from vio.frontend.outliers import pixel_errors
 from vio.frontend.stereo_match import EpipolarRowModel
 from vio.guard.probe import RowProbe
@@ -67,14 +67,6 @@ def _is_match(
     out = stereo_fit._Matches(np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros(1, np.bool_))
     stereo_fit._judge(before, np.zeros(1, np.int64), fits, 200.0, out)
     return bool(out.good[0])
-
-
-def _on_row(row_px: float = 0.0, disparity_px: float = 20.0) -> bool:
-    """Whether two key points may be a stereo match."""
-    out = np.zeros((1, 1), np.bool_)
-    right = np.array([[100.0 - disparity_px], [50.0 + row_px]])
-    descriptors._on_row(np.array([[100.0, 50.0]]), right, 90.0, out)
-    return bool(out[0, 0])
 
 
 def _is_nearest(ratio: float) -> bool:
@@ -192,8 +184,6 @@ LIMITS: dict[str, tuple[Says, float, float]] = {
     "match: disparity": (lambda x: _is_match(disparity_px=x), 0.26, 0.34),
     "match: correlation": (lambda x: _is_match(score=x), 0.74, 0.86),
     "match: peak": (lambda x: not _moved(x), 2.2, 2.8),
-    "key points: row": (lambda x: not _on_row(x), 1.3, 1.7),
-    "key points: disparity": (lambda x: _on_row(disparity_px=x), 0.26, 0.34),
     "key points: ratio": (lambda x: not _is_nearest(x), 0.7, 0.9),
     "errors: depth": (_has_error, 0.043, 0.057),
     "predicted: depth": (_is_moved, 0.087, 0.113),

@@ -16,8 +16,9 @@ from tests.frontend.test_new_limits import _tracks
 from vio.frontend import anchor_fit, flow, moving_object, outliers, right_alone, stereo_fit
 from vio.frontend.anchor_fit import AnchorFit
 from vio.frontend.columns import changed
-from vio.frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
+from vio.frontend.descriptors import DescriptorFrontend, KeypointFlow, _near_guess
 from vio.frontend.given_corners import given_corners
+from vio.frontend.keypoints import Keypoints, MutualNearest
 from vio.frontend.moving_object import TwoMotions, voters
 from vio.frontend.one_camera import disparities
 from vio.frontend.outliers import Consensus, RansacProblem, bearing_consensus, rigid_consensus
@@ -31,7 +32,7 @@ from vio.frontend.stereo_match import EpipolarRowModel
 from vio.frontend.tracks import AnchorBank, Tracks, new_tracks
 from vio.geometry.lie import FloatArray, se3_exp, so3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.records import Image, IntArray, StereoFrame
+from vio.records import Image, StereoFrame
 
 Says = Callable[[float], bool]
 WIDTH, HEIGHT = 480, 300
@@ -419,8 +420,8 @@ def _across(right: float = 1.0, count: int = 100, depths: float = 1.0, off_px: f
     previous: Any = SimpleNamespace(left=levels["before"], right_half="other")
     with pytest.MonkeyPatch.context() as patch:
         found = [Points(before[:, :2]), Points(now[:, :2])]
-        patch.setattr("vio.frontend.descriptors.sift_extractor", lambda *_: lambda *__: found)
-        patch.setattr("vio.frontend.descriptors.MutualNearest", lambda: matched)
+        patch.setattr("vio.frontend.keypoints.sift_extractor", lambda *_: lambda *__: found)
+        patch.setattr("vio.frontend.keypoints.MutualNearest", lambda: matched)
         motion = motion_across(
             _problem(), stereo, previous, levels["left"], levels["right"], np.stack([MOTION])
         )
@@ -428,11 +429,9 @@ def _across(right: float = 1.0, count: int = 100, depths: float = 1.0, off_px: f
 
 
 def _searched(px: float) -> bool:
-    """Whether a key point is near a track in an image of 500 pixels."""
-    nothing: Any = None
-    old: Any = changed(_tracks(1), left=np.zeros((1, 2)))
-    point = np.array([[px, 0.0]])
-    return bool(DescriptorFrontend._near_guess(nothing, old, np.zeros((1, 2)), point, 500)[0, 0])
+    """Whether a key point is near a feature in an image of 500 pixels."""
+    corner = np.zeros((1, 2))
+    return bool(_near_guess(corner, corner, np.array([[px, 0.0]]), 500)[0, 0])
 
 
 def _blobs() -> FloatArray:
@@ -450,7 +449,7 @@ def _follows(moved_px: float) -> bool:
     pixels = np.vstack([[[160.0, row]], np.column_stack([u, v])])
     pixels = pixels[(np.abs(pixels - pixels[0]).max(axis=1) > 29.0) | (np.arange(len(pixels)) == 0)]
     bits = np.random.default_rng(1).integers(0, 256, (len(pixels), 32)).astype(np.uint8)
-    points = [Keypoints(pixels, bits), Keypoints(pixels - [10.0, 0.0], bits)]
+    points = [Keypoints(pixels, bits)]
     settings = FrontendSettings()
     engine = DescriptorFrontend(CAMERA, settings, "orb", lambda *images: points, MutualNearest())
     still = _blobs()
@@ -467,20 +466,13 @@ def _follows(moved_px: float) -> bool:
     return len(first) == 1 and bool(np.isin(first, seen[1].ids)[0])
 
 
-def _is_compared(row: float) -> bool:
-    """Whether a key point in such a row is compared with those of the right image."""
-    bits = np.zeros((1, 32), np.uint8)
-    points = [Keypoints(np.array([[160.0 - shift, row]]), bits) for shift in (0.0, 10.0)]
-    compared: list[int] = []
-
-    def match(left: Keypoints, right: Keypoints, allowed: object) -> IntArray:
-        compared.append(len(left))
-        return np.zeros((0, 2), np.int64)
-
-    engine = DescriptorFrontend(CAMERA, FrontendSettings(), "orb", lambda *_: points, match)
+def _is_used(row: float) -> bool:
+    """Whether a key point in such a row is used."""
+    points = [Keypoints(np.array([[160.0, row]]), np.zeros((1, 32), np.uint8))]
+    flow = KeypointFlow(CAMERA, AnchorBank(1, 9), lambda *_: points, MutualNearest())
     image = _blobs().clip(0, 255).astype(np.uint8)
-    engine.process(StereoFrame(0, 0, image, image))
-    return compared[0] == 1
+    flow.see(image)
+    return len(flow.detect(image)) == 1
 
 
 KEYPOINTS: dict[str, tuple[Says, float, float]] = {
@@ -489,8 +481,8 @@ KEYPOINTS: dict[str, tuple[Says, float, float]] = {
     "across: depths": (lambda x: _across(depths=x), 0.45, 0.55),
     "across: disparities": (lambda x: not _across(off_px=x), 1.7, 2.3),
     "search": (lambda x: not _searched(x), 26.0, 34.0),
-    "follows": (lambda x: not _follows(x), 1.3, 1.7),
-    "border": (_is_compared, 7.7, 8.3),
+    "follows": (lambda x: not _follows(x), 0.8, 1.2),
+    "border": (_is_used, 7.7, 8.3),
 }
 
 

@@ -148,16 +148,13 @@ def with_wall(name: str) -> list[FrontendOutput]:
     return outputs
 
 
-def test_an_object_over_half_the_image_is_named_where_few_points_live_long() -> None:
-    """Those of ORB do not tell which group is the scene."""
-    assert codes(with_wall("orb")) == ["object-or-scene"]
-
-
-@pytest.mark.parametrize("name", ["klt", "sift"])
-def test_an_object_over_half_the_image_is_named_and_not_output(name: str) -> None:
-    """It comes when the scene has been seen for some frames; both have as much texture."""
+@pytest.mark.parametrize("name", FRONT_ENDS)
+def test_an_object_over_half_the_image_is_not_output(name: str) -> None:
+    """It comes when the scene has been seen for some frames; both have as much texture. Key points
+    on it are hardly taken, so that it need not be named.
+    """
     outputs = with_wall(name)
-    assert codes(outputs) == ["object-covers-image"]
+    assert codes(outputs) == (["object-covers-image"] if name == "klt" else [])
     for before, output in pairwise(outputs[7:]):
         u = output.observations.z[np.isin(output.observations.ids, before.observations.ids), 0]
         covered = (u > 0.33 * CAMERA.width) & (u < 0.77 * CAMERA.width)
@@ -165,13 +162,15 @@ def test_an_object_over_half_the_image_is_named_and_not_output(name: str) -> Non
         assert (~covered).sum() > 20
 
 
-@pytest.mark.parametrize("name", ["orb", "sift"])
-def test_frames_with_a_frozen_left_image_give_no_features(name: str) -> None:
+@pytest.mark.parametrize("name", FRONT_ENDS)
+def test_features_are_followed_in_the_right_image_while_the_left_one_is_frozen(name: str) -> None:
     outputs = run(name, _frozen_left)
     assert codes(outputs) == ["left-image-frozen", "-left-image-frozen"]
-    assert [len(output.observations) == 0 for output in outputs] == [
-        k in FAULT for k in range(FRAMES)
-    ]
+    healthy = run(name)
+    for k in FAULT:
+        seen = outputs[k].observations
+        assert len(seen) > 30
+        assert np.isin(seen.ids, healthy[FAULT.start - 1].observations.ids).all()
 
 
 @pytest.mark.parametrize("name", FRONT_ENDS)

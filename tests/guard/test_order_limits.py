@@ -17,7 +17,7 @@ from tests.guard.test_matches import CAMERA, STEP_NS
 from vio.calibration.pair_rotation import PairRotation
 from vio.errors import DataError
 from vio.findings import Finding
-from vio.frontend.descriptors import Keypoints
+from vio.frontend.keypoints import Keypoints
 from vio.frontend.moving_object import MovedPoints
 from vio.frontend.outliers import Consensus, RansacProblem
 from vio.geometry.lie import FloatArray

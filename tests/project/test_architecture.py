@@ -340,6 +340,7 @@ UNUSED_BY_A_SHORT_RUN = {
     "vio.filters.mono_start",
     "vio.filters.vislam",
     "vio.frontend.descriptors",
+    "vio.frontend.keypoints",
     "vio.frontend.given_corners",
     "vio.live.live_odometry",
     "vio.live.odometry",

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vio.frontend.descriptors import OpenCvExtractor
+from vio.frontend.keypoints import OpenCvExtractor
 from vio.geometry.lie import FloatArray
 from vio.guard.turned_points import matched_rows, pixels_in_both
 from vio.records import Image

@@ -178,10 +178,10 @@ def _correlate(before: Image, now: Image, rows: int, columns: int, out: FloatArr
                 row_aa += x * x
                 row_bb += y * y
                 row_ab += x * y
-            a += row_a
-            b += row_b
-            aa += row_aa
-            bb += row_bb
-            ab += row_ab
+            a += float(row_a)
+            b += float(row_b)
+            aa += float(row_aa)
+            bb += float(row_bb)
+            ab += float(row_ab)
         spread = (count * aa - a * a) * (count * bb - b * b)
         out[block] = (count * ab - a * b) / np.sqrt(spread) if spread > 0.0 else 0.0

@@ -23,7 +23,7 @@ from vio.calibration.pair_rotation import (
     rotation_by_rows,
 )
 from vio.dataclass import dataclass
-from vio.frontend.descriptors import Keypoints, OpenCvExtractor
+from vio.frontend.keypoints import Keypoints, OpenCvExtractor
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import Image, IntArray

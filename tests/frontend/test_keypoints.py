@@ -1,0 +1,94 @@
+"""Key points are spread over the image; features are followed where theirs are not detected again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tests.frontend.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
+from vio.frontend.descriptors import DescriptorFrontend
+from vio.frontend.keypoints import (
+    Keypoints,
+    MutualNearest,
+    OpenCvExtractor,
+    orb_extractor,
+    spread_rows,
+)
+from vio.frontend.settings import FrontendSettings, GridSettings, MatchSettings
+from vio.records import Image
+
+SETTINGS = FrontendSettings(
+    grid=GridSettings(target_features=150), match=MatchSettings(max_keypoints=600)
+)
+POSES = flight(6)
+FRAMES = [stereo_frame(k, pose) for k, pose in enumerate(POSES)]
+
+
+def _share_on_strong_half(extract: Callable[..., list[Keypoints]]) -> float:
+    """Share of the key points on the left half of an image, which has five times the contrast."""
+    noise = np.random.default_rng(0).normal(size=(60, 80)).repeat(4, 0).repeat(4, 1)
+    contrast = np.where(np.arange(320) < 160, 60.0, 12.0)
+    image = (128.0 + contrast * noise.clip(-2.0, 2.0)).clip(0, 255).astype(np.uint8)
+    (points,) = extract(image)
+    assert len(points) == 300
+    return float((points.pixels[:, 0] < 160.0).mean())
+
+
+@pytest.mark.parametrize("name", ["orb", "sift"])
+def test_one_thing_of_much_texture_does_not_take_all_key_points(name: str) -> None:
+    assert 0.4 < _share_on_strong_half(OpenCvExtractor(name, 300)) < 0.7
+
+
+def test_rows_are_the_strongest_of_each_cell_then_the_second_ones() -> None:
+    u = np.array([*np.arange(10.0, 20.0), 310.0])  # two cells, for eight points
+    pixels = np.stack([u, np.full(11, 10.0)], axis=1)
+    strength = np.arange(11.0, 0.0, -1.0)
+    chosen = spread_rows(pixels, strength, 8, (160, 320))
+    assert chosen.tolist() == [0, 10, 1, 2, 3, 4, 5, 6]
+    assert spread_rows(pixels[:0], strength[:0], 3, (160, 320)).tolist() == []
+
+
+def _seen(hidden: range) -> list[np.ndarray]:
+    """Ids in each frame, of an extractor that finds nothing in some of them."""
+    orb = orb_extractor(SETTINGS.match)
+    count = 0
+
+    def extract(*images: Image) -> list[Keypoints]:
+        nonlocal count
+        count += 1
+        found = orb(*images)
+        if count - 1 in hidden:
+            return [Keypoints(one.pixels[:0], one.descriptors[:0]) for one in found]
+        return found
+
+    frontend = DescriptorFrontend(CAMERA, SETTINGS, "orb", extract, MutualNearest())
+    return [frontend.process(frame).observations.ids for frame in FRAMES]
+
+
+def test_features_outlast_key_points_that_are_not_detected_again() -> None:
+    """Their pixels are then predicted by the motion of others, or by the last one."""
+    orb = orb_extractor(SETTINGS.match)
+    half = DescriptorFrontend(
+        CAMERA,
+        SETTINGS,
+        "orb",
+        lambda *images: [Keypoints(one.pixels[::2], one.descriptors[::2]) for one in orb(*images)],
+        MutualNearest(),
+    )
+    outputs = [half.process(frame) for frame in FRAMES]
+    shared = np.isin(outputs[1].observations.ids, outputs[-1].observations.ids)
+    assert shared.mean() > 0.7
+    first = outputs[1].observations
+    last = outputs[-1].observations
+    _, i, j = np.intersect1d(first.ids, last.ids, return_indices=True)
+    expected = truth(SLANTED, POSES[1], first.z[i, :2], POSES[-1])
+    assert np.median(np.linalg.norm(last.z[j] - expected, axis=1)) < 0.2
+
+
+def test_no_key_point_at_all_ends_the_features() -> None:
+    seen = _seen(range(3, 4))
+    assert len(seen[2]) > 100
+    assert len(seen[3]) == 0
+    assert len(seen[5]) > 100
