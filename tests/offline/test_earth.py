@@ -322,6 +322,36 @@ def test_positions_of_another_extent_are_refused() -> None:
             georeference(drive.path, replace(fixes, geodetic=geodetic), LEVER_M)
 
 
+_REVERSED_NORTH = np.diag([1.0, -1.0, 1.0])
+_SWAPPED = np.eye(3)[[1, 0, 2]]
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("precise", [False, True])
+@pytest.mark.parametrize("hand", [_REVERSED_NORTH, _SWAPPED], ids=["north reversed", "swapped"])
+def test_mirrored_positions_are_named(hand: FloatArray, precise: bool, seed: int) -> None:
+    """As those of CARLA 0.9.16, whose latitudes rise to the south (finding F118)."""
+    drive = _drive(seed=seed)
+    fixes = _precise(drive) if precise else drive.fixes
+    frame = LocalFrame(ORIGIN)
+    mirrored = replace(
+        fixes,
+        geodetic=frame.geodetic(frame.enu(fixes.geodetic) @ hand.T),
+        covariance=hand @ fixes.covariance @ hand.T,
+    )
+    with pytest.raises(EstimationError, match="the GNSS positions are mirrored: "):
+        georeference(drive.path, mirrored, LEVER_M)
+
+
+def test_positions_that_agree_by_no_mirror_are_not_called_mirrored() -> None:
+    jumps = tuple(
+        (k, k + 7, (60.0 * (-1) ** k, 45.0 * (-1) ** (k // 2), 0.0)) for k in range(0, 98, 7)
+    )
+    drive = _drive(seed=0, jumps=jumps)
+    with pytest.raises(EstimationError, match=r"^only \d+ of 100 GNSS positions agree"):
+        georeference(drive.path, drive.fixes, LEVER_M)
+
+
 def test_clocks_that_usual_differences_explain_are_named() -> None:
     drive = _drive(seed=0, poses=100)
     with pytest.raises(EstimationError, match="18 s \\(GPS time and UTC\\)"):

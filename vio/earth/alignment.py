@@ -65,6 +65,11 @@ _DRIFT_RAD = float(np.radians(0.03))
 _SCALE_SIGMA = 0.01  # prior
 
 
+# of N positions: pose before, share of the way to the next one, (N, 3) in east, north, up, their
+# covariances (N, 3, 3), and whether each has a height
+_OfFixes = tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray]
+
+
 @dataclass(frozen=True, slots=True)
 class Path:
     """A finished trajectory as a graph; K poses."""
@@ -154,6 +159,8 @@ def georeference(
     residuals = np.full((len(fixes), 3), np.nan)
     used[inside] = weight[:, 0] > 0.5
     used_height[inside] = weight[:, 1] > 0.5
+    if 2 * int(used.sum()) < int(inside.sum()):
+        _check_hand(path, of_fixes, lever_arm_m, int(used.sum()))
     if int(used.sum()) < _ALIGNMENT.min_fixes:
         raise EstimationError(
             f"only {int(used.sum())} of {int(inside.sum())} GNSS positions agree with the "
@@ -208,6 +215,39 @@ def _check_extents(
         f"the GNSS positions spread over {gnss_m:.3g} m (median from their middle) and the trajectory at "
         f"these times over {own_m:.3g} m; {why}"
     )
+
+
+def _check_hand(path: Path, of_fixes: _OfFixes, lever_arm_m: FloatArray, used: int) -> None:
+    """Raise EstimationError where most positions agree with the trajectory once they are mirrored.
+
+    A mirrored east, a mirrored north and the two swapped differ by a turn about the vertical, which
+    is estimated: one mirror tries all three.
+
+    Args:
+        path: the trajectory.
+        of_fixes: the positions within its time.
+        lever_arm_m: (3,) the antenna in the body frame.
+        used: how many positions agree as they are.
+    """
+    before, share, measured, covariance, has_height = of_fixes
+    mirror = np.array([-1.0, 1.0, 1.0])
+    problem = _Problem(
+        path,
+        before,
+        share,
+        measured * mirror,
+        covariance * np.outer(mirror, mirror),
+        has_height,
+        lever_arm_m,
+    )
+    _, _, weight = problem.solve()
+    agreeing = int((weight[:, 0] > 0.5).sum())
+    if 2 * agreeing > len(measured):
+        raise EstimationError(
+            f"the GNSS positions are mirrored: {used} of {len(measured)} agree with the trajectory, "
+            f"and {agreeing} with east or north reversed; change the sign of one of them, as for "
+            "CARLA 0.9.16, or exchange them"
+        )
 
 
 def _spread_m(points: FloatArray) -> float:
