@@ -217,14 +217,14 @@ def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibrati
         for key in ("extL_T_imu", "extR_T_imu")
     ]
     inverses = [se3_inverse(T) for T in given]
-    for axes in (np.eye(4), _OPTICAL_FROM_FORWARD):
-        for left, right in (given, inverses):
-            T_cam1_cam0 = axes @ right @ se3_inverse(axes @ left)
-            x, y, z = T_cam1_cam0[:3, 3]
-            aligned = np.abs(T_cam1_cam0[:3, :3] - np.eye(3)).max() < _RIG.max_deviation
-            if aligned and x < 0 and np.hypot(y, z) < RECTIFIED_SHARE * -x:
-                return _Calibration(_camera(K, float(-x), path), axes @ left, ambiguous=False)
-    T_cam1_cam0 = inverses[1] @ given[0]
+    # of cameras along x in the stated direction alone: the other one is that of exchanged cameras
+    for left, right in (given, inverses, [_OPTICAL_FROM_FORWARD @ T for T in given]):
+        T_cam1_cam0 = right @ se3_inverse(left)
+        x, y, z = T_cam1_cam0[:3, 3]
+        aligned = np.abs(T_cam1_cam0[:3, :3] - np.eye(3)).max() < _RIG.max_deviation
+        if aligned and x < 0 and np.hypot(y, z) < RECTIFIED_SHARE * -x:
+            return _Calibration(_camera(K, float(-x), path), left, ambiguous=False)
+    T_cam1_cam0 = given[1] @ inverses[0]
     raise CalibrationError(
         f"{path}: extL_T_imu and extR_T_imu place the cameras "
         f"{np.round(T_cam1_cam0[:3, 3], 4).tolist()} m apart; the "
