@@ -162,6 +162,16 @@ def test_without_times_the_rate_of_the_file_counts_and_it_is_said(
     )
 
 
+def test_each_video_may_lie_in_a_folder_of_its_own(videos: Path, tmp_path: Path) -> None:
+    path = copy_of(videos, tmp_path / "v")
+    for side in ("left", "right"):
+        (path / side).mkdir()
+        (path / f"{side}.avi").rename(path / side / "output.avi")
+    moved, together = open_dataset(path), open_dataset(videos)
+    assert moved.recording.kind == "video"
+    assert_same_events(together, moved, 0, 3)
+
+
 def write_uneven(path: Path, images: list[np.ndarray], ticks: list[int]) -> None:
     """Write gray images as JPEG, image k presented at a multiple of 50 ms."""
     size = images[0].shape[1], images[0].shape[0]

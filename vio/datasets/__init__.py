@@ -227,9 +227,8 @@ def _unknown(path: Path) -> str:
         )
     if path.is_file() and path.suffix.lower() in _OF_NUMBERS:
         return (
-            f"{path}: holds numbers or text, which are no recording by themselves; features of "
-            "another program become one by vio.write_observations, and tables of a recording are "
-            "read in its folder"
+            f"{path}: no known recording, but numbers or text; features of another program become "
+            "one by vio.write_observations, and tables of a recording are read in its folder"
         )
     if (unread := unread_files(path)) is not None:
         return unread

@@ -489,7 +489,7 @@ def _of_camera(arrays: Mapping[str, np.ndarray]) -> str | None:
             "baseline in metres"
         )
     if len(arrays["image_size"]) not in (0, 2):
-        return f"image_size has {len(arrays['image_size'])} numbers, not width and height"
+        return f"image_size is {arrays['image_size'].tolist()}, not width and height"
     residual = arrays.get("residual_px", np.zeros(()))
     if not 0 <= residual < np.inf:
         return f"residual_px is {residual.tolist()!r}, no number of pixels"

@@ -75,10 +75,16 @@ class _Facts:
 def video_files(path: Path) -> tuple[Path, Path] | None:
     """Return the left and right video file of a folder, twice the same where there is one alone;
     None: it has none, or several that are no pair.
+
+    Each may be the only video in a folder of its own (`left/video.mp4 right/video.mp4`).
     """
-    found = {
-        child.stem: child for child in sorted(path.iterdir()) if child.suffix.lower() in SUFFIXES
-    }
+    found = {video.stem: video for video in _videos_in(path)}
+    if not found:
+        for names in _NAMES:
+            inside = [_videos_in(path / name) for name in names]
+            if all(len(videos) == 1 for videos in inside):
+                return inside[0][0], inside[1][0]
+        return None
     if len(found) == 1:
         (alone,) = found.values()
         return alone, alone
@@ -87,6 +93,13 @@ def video_files(path: Path) -> tuple[Path, Path] | None:
     if len(known) == 1:
         return (found[known[0][0]], found[known[0][1]])
     return None
+
+
+def _videos_in(folder: Path) -> list[Path]:
+    """Return the videos of a folder by name; none: it has none, or is no folder."""
+    if not folder.is_dir():
+        return []
+    return [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES]
 
 
 def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
