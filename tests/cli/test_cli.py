@@ -536,6 +536,47 @@ def test_an_unknown_option_shows_the_usage_of_its_command(
     assert "unrecognized arguments: --alignment" in message
 
 
+@pytest.mark.parametrize(
+    ("argv", "hint"),
+    [
+        (["run", "a", "results"], "results; if results go there, write --out results"),
+        (["run", "a", "--set", "msckf.clones", "5"], "5; write --set msckf.clones=5"),
+        (["calibrate", "a", "--stop", "5"], "--stop 5\n"),  # no other option is like it
+    ],
+)
+def test_what_is_too_much_is_told_where_it_goes(
+    argv: list[str], hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(argv)
+    assert f"unrecognized arguments: {hint}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("runs/streeet", "does not exist; did you mean {tmp}/runs/street?"),
+        ("runs/other", "does not exist; give a folder that `vio run` wrote"),
+        (
+            "runs/street/trajectory.tum",
+            "is a file of a run; give the folder of the run, {tmp}/runs/street",
+        ),
+        ("runs", "holds the results of runs; give one of them, such as {tmp}/runs/street"),
+        ("images", "no run folder"),
+    ],
+)
+@pytest.mark.parametrize("command", ["check", "report"])
+def test_what_is_no_run_is_told_which_run_may_be_meant(
+    command: str, given: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "runs" / "street").mkdir(parents=True)
+    for name in ("metrics.json", "trajectory.tum"):
+        (tmp_path / "runs" / "street" / name).write_text("{}")
+    assert main([command, str(tmp_path / given)]) == 1
+    assert said.format(tmp=tmp_path) in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("argv", [["eval", "a", "--gt", "b"], ["inspect", "a", "--loops"]])
 def test_a_word_of_another_command_is_not_taken_for_one_spelt_alike(
     argv: list[str], capsys: pytest.CaptureFixture[str]

@@ -253,7 +253,7 @@ def test_a_path_with_a_colon_is_a_path_when_it_exists(
         ("other", "other: no known recording; looked for a ROS bag .*, a KITTI folder"),
         ("root", re.escape("root holds several KITTI sequences")),
         ("several", r"several: is no recording, but holds a\.npz \(ece276a\), b\.npz "),
-        ("text.txt", "text.txt: no known recording; looked for"),
+        ("text.txt", "text.txt: no known recording, but numbers or text"),
         ("half.npz", "half.npz: is damaged"),
         ("log:text.txt", "text.txt: is damaged or no .npz archive"),
     ],

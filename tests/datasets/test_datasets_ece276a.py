@@ -26,6 +26,7 @@ from tests.dataset_makers import (
     make_npz,
 )
 from vio.calibration.egomotion import stereo_twists
+from vio.datasets import open_dataset
 from vio.datasets.common import read_npz
 from vio.datasets.ece276a import read_ece276a
 from vio.datasets.features import FeatureDataset
@@ -96,6 +97,64 @@ def test_accepts_newer_extrinsics_in_both_directions(tmp_path: Path) -> None:
         arrays[key] = se3_inverse(arrays[key])
     dataset = read_ece276a(make_npz(tmp_path / "a.npz", arrays), DEFAULT)
     np.testing.assert_allclose(dataset.recording.T_cam0_imu, T_CAM0_IMU, atol=1e-12)
+
+
+def make_npy(path: Path, arrays: Arrays, **others: object) -> Path:
+    """Write the dictionary of arrays that the course hands out since 2025: a row for each time."""
+    by_time = {key: arrays[key].T for key in ("v_t", "w_t")}
+    np.save(path, {**arrays, **by_time, **others}, allow_pickle=True)  # type: ignore[arg-type] # a dictionary is one object
+    return path
+
+
+@pytest.mark.parametrize("frames", [3, 6])
+def test_a_pickled_dictionary_is_read_as_the_archive(frames: int, tmp_path: Path) -> None:
+    arrays = ece276a_new_arrays(make_drive(frames))
+    archive = open_dataset(make_npz(tmp_path / "a.npz", arrays))
+    dataset = open_dataset(make_npy(tmp_path / "a.npy", arrays))
+    assert isinstance(archive, FeatureDataset)
+    assert isinstance(dataset, FeatureDataset)
+    assert dataset.recording.kind == "ece276a"
+    np.testing.assert_array_equal(dataset.tracks.z, archive.tracks.z)
+    for ours, expected in zip(dataset.motion, archive.motion, strict=True):
+        np.testing.assert_array_equal(ours.linear, expected.linear)
+        np.testing.assert_array_equal(ours.angular, expected.angular)
+
+
+def test_extrinsics_of_cameras_that_look_along_x_are_turned(tmp_path: Path) -> None:
+    arrays = ece276a_new_arrays(make_drive(6))
+    forward = np.eye(4)  # x forward, y left, z up, from the image's x right, y down, z forward
+    forward[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    for key in ("extL_T_imu", "extR_T_imu"):
+        arrays[key] = forward @ arrays[key]
+    dataset = read_ece276a(make_npy(tmp_path / "a.npy", arrays), DEFAULT)
+    np.testing.assert_allclose(dataset.recording.T_cam0_imu, T_CAM0_IMU, atol=1e-12)
+    assert dataset.recording.camera.baseline_m == pytest.approx(CAMERA.baseline_m)
+
+
+class _Runs:
+    """An object that a pickle makes by calling a function."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (Path("touched"),)
+
+
+def test_a_dictionary_that_would_run_code_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = make_npy(tmp_path / "a.npy", ece276a_new_arrays(make_drive(6)), more=_Runs())
+    with pytest.raises(DataError, match=r"a\.npy: no arrays can be read of it"):
+        open_dataset(path)
+    assert not (tmp_path / "touched").exists()
+
+
+def test_a_dictionary_without_features_and_a_cut_one_are_named(tmp_path: Path) -> None:
+    path = make_npy(tmp_path / "a.npy", ece276a_new_arrays(make_drive(6)), features=None)
+    with pytest.raises(DataError, match=r"found K_l .* are written by vio\.write_observations"):
+        open_dataset(path)
+    path.write_bytes(path.read_bytes()[:900])
+    with pytest.raises(DataError, match=r"a\.npy: no arrays can be read of it"):
+        open_dataset(path)
 
 
 def test_left_only_features_have_no_right_pixel(tmp_path: Path) -> None:
@@ -277,9 +336,9 @@ BAD = [
         r"time_stamps has shape 1 x 6 .*expected 1 x 7",
     ),
     (
-        changed("linear_velocity", np.zeros((6, 3))),
+        changed("linear_velocity", np.zeros((5, 3))),
         DataError,
-        r"linear_velocity has shape 6 x 3 .*expected 3 x 6",
+        r"linear_velocity has shape 5 x 3 .*expected 3 x 6",
     ),
     (changed("K", np.eye(4)), DataError, r"K has shape 4 x 4"),
     (

@@ -162,6 +162,51 @@ def test_without_times_the_rate_of_the_file_counts_and_it_is_said(
     )
 
 
+def spectacular_ai(videos: Path, folder: Path, leave_out: int = 0) -> Path:
+    """Write the videos and the IMU as Spectacular AI records them: all times in `data.jsonl`, without
+    those of some frames at the end.
+    """
+    path = copy_of(videos, folder, "times.txt", "imu.csv")
+    (path / "left.avi").rename(path / "data.avi")
+    (path / "right.avi").rename(path / "data2.avi")
+    lines = []
+    for row in (videos / "imu.csv").read_text().splitlines()[1:]:
+        t, *values = row.split(",")
+        for name, triple in (("gyroscope", values[:3]), ("accelerometer", values[3:])):
+            sensor = f'{{"type": "{name}", "values": [{", ".join(triple)}]}}'
+            lines.append(f'{{"sensor": {sensor}, "time": {int(t) / 1e9:.9f}}}')
+    times = (videos / "times.txt").read_text().splitlines()[1:]
+    for t in times[: len(times) - leave_out]:
+        frames = f'[{{"cameraInd": 0, "time": {t}}}, {{"cameraInd": 1, "time": {t}}}]'
+        lines.append(f'{{"frames": {frames}, "number": 1, "time": 0.5}}')
+    (path / "data.jsonl").write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_recording_of_spectacular_ai_has_the_times_of_its_frames(
+    videos: Path, tmp_path: Path
+) -> None:
+    dataset = open_dataset(spectacular_ai(videos, tmp_path / "v"))
+    assert dataset.recording.kind == "video"
+    assert_same_events(open_dataset(videos), dataset)
+    cut = open_dataset(spectacular_ai(videos, tmp_path / "cut", leave_out=2)).recording
+    count = len(dataset.recording.frame_times_ns)
+    assert len(cut.frame_times_ns) == count - 2
+    assert (
+        f"data.jsonl has {count - 2} frames, the videos {count}; the first ones count" in cut.notes
+    )
+
+
+def test_each_video_may_lie_in_a_folder_of_its_own(videos: Path, tmp_path: Path) -> None:
+    path = copy_of(videos, tmp_path / "v")
+    for side in ("left", "right"):
+        (path / side).mkdir()
+        (path / f"{side}.avi").rename(path / side / "output.avi")
+    moved, together = open_dataset(path), open_dataset(videos)
+    assert moved.recording.kind == "video"
+    assert_same_events(together, moved, 0, 3)
+
+
 def write_uneven(path: Path, images: list[np.ndarray], ticks: list[int]) -> None:
     """Write gray images as JPEG, image k presented at a multiple of 50 ms."""
     size = images[0].shape[1], images[0].shape[0]

@@ -403,7 +403,7 @@ def test_an_interrupted_refinement_leaves_nothing(
 def test_refine_reports_unusable_runs(
     simulation: Simulation, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "no run folder" in refused(capsys, "refine", tmp_path)
+    assert "holds the results of runs" in refused(capsys, "refine", tmp_path)
     short = _make_run(simulation, tmp_path / "short", stop=1)
     assert "a run of 1 frames has fewer than two views" in refused(capsys, "refine", short)
     blink = _make_run(simulation, tmp_path / "blink", stop=20, lost_after=1)

@@ -285,7 +285,7 @@ def test_rows_without_a_position_are_skipped_and_counted(tmp_path: Path) -> None
         ("0,nan,nan,1\n", "holds no position"),
         ("0,0,0,0\n", "holds no position"),
         ("0,489800000,83900000,115000\n", "divide receivers' 1e-7 degrees"),
-        ("time,lat,lon,alt,vn,ve,vd\n0,49,8,1,0,0,0\n", "has the columns time,lat"),
+        ("time,easting,northing,alt\n0,49,8,1\n", "has the columns time,easting"),
         ("", "holds no line of data"),
     ],
 )
@@ -525,7 +525,7 @@ def test_places_a_run(
         ([str(run), str(tmp_path / "none.csv")], "holds no GNSS positions"),
         ([str(run), str(gnss), "--lever-arm", "1,2"], "--lever-arm takes three numbers"),
         ([str(run), str(gnss), "--time-offset", "1000"], "are within the trajectory"),
-        ([str(tmp_path), str(gnss)], "no run folder"),
+        ([str(tmp_path), str(gnss)], "holds the results of runs; give one of them"),
     ):
         assert message in refused(capsys, "georeference", *arguments)
     # the first frame, seen again

@@ -104,6 +104,13 @@ def test_perfect_features_give_a_perfect_trajectory() -> None:
     assert result.trajectory.frame_indices.tolist() == list(range(30))
 
 
+@pytest.mark.parametrize("span", [{"stop": 3.0}, {"start": [1]}, {"start": "2"}])
+def test_ends_of_a_range_are_whole_numbers(span: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match="start and stop are numbers of frames, not"):
+        run(FakeDrive(), Config(), **span)
+    assert len(run(FakeDrive(), Config(), start=np.int64(1), stop=np.int64(4)).frames) == 3
+
+
 def test_part_of_a_recording_keeps_its_frame_numbers() -> None:
     result = run(FakeDrive(), Config(), start=5, stop=12)
     assert [f.index for f in result.frames] == list(range(5, 12))

@@ -288,10 +288,12 @@ class Rig:
             time_offset_s: a frame stamped t was exposed at t + offset of the IMU's clock.
 
         Raises:
-            CalibrationError: a focal length, the baseline, the size or the transform is impossible.
+            CalibrationError: a focal length, the baseline, the size or the transform is impossible,
+                or `cu` and `cv` are exchanged.
         """
         StereoCamera(fu, fv, cu, cv, baseline_m, width, height)  # checks baseline and focal lengths
         one = CameraModel(fu, fv, cu, cv, width, height)
+        _check_principal_point(one)
         T_cam1_cam0 = se3_from_parts(np.eye(3), [-baseline_m, 0.0, 0.0])
         T = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
         return cls(one, one, T_cam1_cam0, T, imu_noise, time_offset_s)
@@ -330,13 +332,15 @@ class Rig:
             time_offset_s: a frame stamped t was exposed at t + offset of the IMU's clock.
 
         Raises:
-            CalibrationError: a matrix has a wrong form, or the model does not take these
-                coefficients.
+            CalibrationError: a matrix has a wrong form, the model does not take these coefficients,
+                or a principal point is that of an image as high as this one is wide.
         """
         cam0, cam1 = (
             camera_from_matrix(K, width, height, model, distortion, name)
             for K, distortion, name in ((K0, distortion0, "K0"), (K1, distortion1, "K1"))
         )
+        for camera in (cam0, cam1):
+            _check_principal_point(camera)
         T_imu = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
         return cls(
             cam0,
@@ -535,3 +539,17 @@ def rig_of_rectified(camera: StereoCamera, T_cam0_imu: FloatArray | None) -> Rig
     return Rig.rectified(
         c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height, T_cam0_imu
     )
+
+
+def _check_principal_point(camera: CameraModel) -> None:
+    """Raise CalibrationError where a principal point is outside of the image, and would not be with
+    its two numbers, or with width and height, in each other's place.
+    """
+    inside = 0 < camera.cu < camera.width and 0 < camera.cv < camera.height
+    exchanged = 0 < camera.cv < camera.width and 0 < camera.cu < camera.height
+    if not inside and exchanged:
+        raise CalibrationError(
+            f"the principal point {camera.cu:g}, {camera.cv:g} lies outside images of "
+            f"{camera.width} x {camera.height} pixels: cu and cv, or width and height, are "
+            "exchanged"
+        )

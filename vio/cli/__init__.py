@@ -70,6 +70,7 @@ _MEANT_OPTIONS = {
     **dict.fromkeys(("--loop-closure", "--loops", "--slam"), "--map FILE"),
     **dict.fromkeys(("--mono", "--one-camera"), "--camera left"),
 }
+_ALIKE = 0.7  # of words, from where on one may be meant by the other
 _FILES = {"eval": "evaluate", "calibrate-rig": "calibrate_rig", "imu-noise": "imu_noise"}
 COMMANDS = tuple(name for names in BY_PURPOSE.values() for name in names)
 
@@ -173,6 +174,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         hint = ""
         if first.startswith("-"):
             hint = _near(first, chosen._option_string_actions, _MEANT_OPTIONS)
+        elif "--set" in words and words[words.index("--set") + 1 :][1:2] == unknown[:1]:
+            hint = f"; write --set {words[words.index('--set') + 1]}={first}"
+        elif "--out" in chosen._option_string_actions and "--out" not in words:
+            hint = f"; if results go there, write --out {first}"
         chosen.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     args.command_line = shlex.join(["vio", *words])
     return args
@@ -186,7 +191,7 @@ def _near(word: str, known: Iterable[str], meant: Mapping[str, str]) -> str:
     instead = meant.get(word)
     if instead is not None:
         return f"; did you mean {instead}?" if instead.split()[0] in names else ""
-    near = difflib.get_close_matches(word, names, 1)
+    near = difflib.get_close_matches(word, names, 1, _ALIKE)
     return f"; did you mean {near[0]}?" if near else ""
 
 

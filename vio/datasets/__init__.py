@@ -38,6 +38,8 @@ MODULES = [
     "utias",
 ]
 _FILES = (".npz", ".mat", ".bag", ".db3", ".mcap")  # recordings that are one file
+# forms of tables and of Python's objects, as trackers write their features
+_OF_NUMBERS = (".npy", ".csv", ".tsv", ".txt", ".json", ".jsonl", ".pkl", ".pickle", ".parquet")
 _MAX_LOOKED_AT = 200  # of what a folder holds that is no recording itself
 _MAX_NAMED = 3  # of the recordings in it
 _LEVELS_ABOVE = 3  # folders in which a file of a recording may lie
@@ -77,6 +79,10 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
             the known kinds.
         CalibrationError: the recording's calibration is invalid.
     """
+    if not isinstance(source, str | os.PathLike):
+        raise DataError(
+            f"a recording is named by one path, as text or pathlib.Path, not by {type(source).__name__}"
+        )
     kind, path = _parse(os.fspath(source))
     _check_there(path)
     settings = options or DatasetSettings()
@@ -219,8 +225,20 @@ def _unknown(path: Path) -> str:
             f"{path}: is one video; give a folder with left.mp4, right.mp4 and the calibration of the "
             "pair, or with this video alone where it shows left and right side by side"
         )
+    if path.is_file() and path.suffix.lower() in _OF_NUMBERS:
+        return (
+            f"{path}: no known recording, but numbers or text; features of another program become "
+            "one by vio.write_observations, and tables of a recording are read in its folder"
+        )
     if (unread := unread_files(path)) is not None:
         return unread
+    if path.is_dir() and (folders := plain.image_folders(path)):
+        (name,) = folders
+        return (
+            f"{path}: holds images in {name}, of which it is not clear what they show; put those of a "
+            "stereo camera into left and right, or those of one camera into left, with their "
+            "calibration (and for one camera imu.csv, or its depths in depth) beside these folders"
+        )
     if path.is_dir():
         films = [file.name for file in path.iterdir() if file.suffix.lower() in videos.SUFFIXES]
         if len(films) > 1:

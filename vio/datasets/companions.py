@@ -54,6 +54,7 @@ IMU_FILES = (
 # of data sets and SDKs, read where the pose of the IMU is known
 _LOGGED_IMU_FILES = (
     "sensor_data/xsens_imu.csv", "xsens_imu.csv", "ms25.csv", "imu.jsonl", "data.jsonl",
+    "imu_data.txt",
 )  # fmt: skip
 # of a gyro and an accelerometer that have a file each
 _GYRO_FILES = ("gyro.csv", "gyro.txt", "gyr.csv", "gyr.txt", "gyroscope.csv", "gyroscope.txt")

@@ -1,8 +1,9 @@
-"""ECE276A course files: velocities, stereo features and calibration in one `.npz`.
+"""ECE276A course files: velocities, stereo features and calibration in one `.npz` or `.npy`.
 
 Two generations of key names are read:
 `time_stamps features linear_velocity rotational_velocity K b cam_T_imu`, and
-`timestamps features v_t w_t K_l K_r extL_T_imu extR_T_imu`.
+`timestamps features v_t w_t K_l K_r extL_T_imu extR_T_imu`. The latter is handed out as a pickled
+dictionary of arrays in an `.npy`, with a row of `v_t` and `w_t` for each time.
 
 In the published files of the first kind `cam_T_imu` mixes two conventions: its rotation maps the
 IMU frame to the camera, but its translation is the camera's position in the IMU frame. The
@@ -32,6 +33,7 @@ from vio.datasets.common import (
 )
 from vio.datasets.features import FeatureDataset
 from vio.datasets.kitti import RECTIFIED_SHARE
+from vio.datasets.pickled import begins_as_npy, is_pickled_dictionary, read_pickled_arrays
 from vio.datasets.reader import Reader
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings, ExtrinsicsMode
@@ -63,6 +65,10 @@ class _RigRules(NamedTuple):
 
 
 _RIG = _RigRules()
+# axes of an image, x right and z forward, from those of a robot, x forward and z up
+_OPTICAL_FROM_FORWARD = np.array(
+    [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +86,12 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
             expected form.
         CalibrationError: the calibration is invalid.
     """
-    arrays = read_npz(path, (*OLD_KEYS, *NEW_KEYS))
+    if begins_as_npy(path):
+        arrays = read_pickled_arrays(path)
+        names = frozenset(arrays)
+    else:
+        arrays = read_npz(path, (*OLD_KEYS, *NEW_KEYS))
+        names = npz_names(path)
     if set(OLD_KEYS) <= set(arrays):
         time_key = "time_stamps"
         linear_key = "linear_velocity"
@@ -95,7 +106,8 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
         raise DataError(
             f"{path}: an ECE276A file needs the keys {' '.join(OLD_KEYS)} (or "
             f"{' '.join(NEW_KEYS)}); "
-            f"found {' '.join(sorted(npz_names(path))) or 'none'}"
+            f"found {' '.join(sorted(names)) or 'none'}; features of a tracker of yours are written "
+            "by vio.write_observations"
         )
     features = _array(
         arrays, "features", path, lambda s: len(s) == 3 and s[0] == 4 and s[2] > 1, "4 x M x T"
@@ -157,8 +169,13 @@ def _array(
 
 
 def _velocities(arrays: Mapping[str, np.ndarray], key: str, path: Path, count: int) -> FloatArray:
-    values = _array(arrays, key, path, lambda s: s == (3, count), f"3 x {count}")
-    return np.ascontiguousarray(finite_rows(values.T, f"{path}: {key}"))
+    values = _array(
+        arrays, key, path, lambda s: s in ((3, count), (count, 3)), f"3 x {count} or {count} x 3"
+    )
+    # of three frames the form of the file decides: a dictionary has a row for each time
+    by_time = values.shape == (count, 3) and (count != 3 or begins_as_npy(path))
+    rows = values if by_time else values.T
+    return np.ascontiguousarray(finite_rows(rows, f"{path}: {key}"))
 
 
 def _intrinsics(arrays: Mapping[str, np.ndarray], key: str, path: Path) -> FloatArray:
@@ -185,7 +202,7 @@ def _old_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibrati
 
 def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibration:
     """Read the newer calibration; the two extrinsics of a rectified pair determine which way
-    they map.
+    they map, and whether their cameras look along z, as images do, or along x.
     """
     K = _intrinsics(arrays, "K_l", path)
     K_right = _intrinsics(arrays, "K_r", path)
@@ -199,12 +216,15 @@ def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibrati
         )
         for key in ("extL_T_imu", "extR_T_imu")
     ]
-    for left, right in (given, [se3_inverse(T) for T in given]):
+    inverses = [se3_inverse(T) for T in given]
+    # of cameras along x in the stated direction alone: the other one is that of exchanged cameras
+    for left, right in (given, inverses, [_OPTICAL_FROM_FORWARD @ T for T in given]):
         T_cam1_cam0 = right @ se3_inverse(left)
         x, y, z = T_cam1_cam0[:3, 3]
         aligned = np.abs(T_cam1_cam0[:3, :3] - np.eye(3)).max() < _RIG.max_deviation
         if aligned and x < 0 and np.hypot(y, z) < RECTIFIED_SHARE * -x:
             return _Calibration(_camera(K, float(-x), path), left, ambiguous=False)
+    T_cam1_cam0 = given[1] @ inverses[0]
     raise CalibrationError(
         f"{path}: extL_T_imu and extR_T_imu place the cameras "
         f"{np.round(T_cam1_cam0[:3, 3], 4).tolist()} m apart; the "
@@ -259,8 +279,9 @@ def _explain(verdict: LeverArmVerdict, t: FloatArray) -> str:
 READERS = (
     Reader(
         kind="ece276a",
-        looked_for="an ECE276A .npz",
+        looked_for="an ECE276A .npz or .npy",
         read=read_ece276a,
-        is_file=begins_as_zip,  # a log of observations is asked for before
+        # a log of observations is asked for before
+        is_file=lambda path: begins_as_zip(path) or is_pickled_dictionary(path),
     ),
 )

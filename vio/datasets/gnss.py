@@ -12,15 +12,46 @@ from vio.datasets.bags.index import stamp_of
 from vio.datasets.bags.kinds import is_bag
 from vio.datasets.bags.store import Bag
 from vio.datasets.gnss_fixes import UP_SHARE, GnssFixes, checked_fixes
-from vio.datasets.tables import drive_times, read_table, stamps_ns
+from vio.datasets.tables import (
+    NumberTable,
+    drive_times,
+    read_logged_table,
+    read_table,
+    stamps_ns,
+)
 from vio.errors import DataError
 from vio.files.stamps import Pace
 from vio.files.text import check_increasing, text_lines
+from vio.geometry.lie import FloatArray
+from vio.records import BoolArray
 
 _FORM = "time_s,latitude_deg,longitude_deg,height_m,sigma_east_m,sigma_north_m,sigma_up_m"
 _SIGMA_WORDS = ("sigma", "std", "sd", "dev", "acc", "err")
 # steps of receivers, whose stamps may be in ms, us or ns
 _FIX_PACE = Pace("positions", 5e-3, 15.0, 5e-3)
+_MOST_COLUMNS = 7  # of a table in the form above
+# latitude, longitude and height, in names of columns; and in those of something else about them
+_PLACES = tuple(
+    re.compile(rf"(?:^|[^a-z]){words}(?:[^a-z]|$)")
+    for words in (
+        "lat(?:itude)?",
+        "(?:lon|lng|long|longitude)",
+        "(?:alt|altitude|height|elevation)",
+    )
+)
+_NO_PLACE = re.compile("|".join((*_SIGMA_WORDS, "cov", "vel", "speed", "ref")))
+_RADIANS = re.compile(r"[^a-z]rad")
+_STATUS = re.compile(r"(?:^|[^a-z])status[./]status$")
+_COVARIANCE = re.compile(r"position_covariance[^a-z]*\d\]?$")
+_OTHER_FORMS = {
+    ".gpx": "GPX",
+    ".kml": "KML",
+    ".nmea": "a receiver's NMEA",
+    ".ubx": "a receiver's UBX",
+    ".pos": "RTKLIB's solution (its time is that of GPS)",
+    ".json": "JSON",
+    ".geojson": "GeoJSON",
+}
 _OXTS_COLUMNS = 30
 _OXTS_ACCURACY = 23  # column of pos_accuracy, m
 _OXTS_MIN_M = 0.02
@@ -50,11 +81,21 @@ def read_gnss(path: Path, topic: str | None = None) -> GnssFixes:
 
 def _read_csv(path: Path) -> GnssFixes:
     """Read a table with or without the standard deviations; empty or NaN: not known."""
-    columns = 4 if _width_of_last_row(path) == 4 else 7
+    if path.suffix.lower() in _OTHER_FORMS:
+        raise DataError(
+            f"{path}: {_OTHER_FORMS[path.suffix.lower()]} is not read; write its positions as a table "
+            f"{_FORM}"
+        )
+    width = _width_of_last_row(path)
+    if width > _MOST_COLUMNS:
+        return _read_logged(path)
+    columns = 4 if width == 4 else 7
     table = read_table(path, columns, _FORM)
     values = table.values
     if table.header:
         order = _order(table.header)
+        if order is None and _places_in(table.header) is not None:
+            return _read_logged(path)
         if order is None:
             raise DataError(f"{path}: has the columns {','.join(table.header)}; expected {_FORM}")
         values = values[:, [*order, *range(2, columns - 1)]]
@@ -68,6 +109,69 @@ def _read_csv(path: Path) -> GnssFixes:
     times_ns = check_increasing(stamps_ns(table, _FIX_PACE, notes), table.where)
     covariance = np.eye(3) * sigmas[:, None, :] ** 2
     return checked_fixes(times_ns, values[:, :3], covariance, str(path), tuple(notes))
+
+
+def _read_logged(path: Path) -> GnssFixes:
+    """Read a table of more columns, or in another order, by the names in its header: NavSatFix
+    messages that a program wrote a row each, or a logger's.
+    """
+    notes = list[str]()
+    table = read_logged_table(path, _FORM, notes)
+    places = _places_in(table.header)
+    if places is None:
+        raise DataError(
+            f"{path}: no header names columns of latitude and longitude; name them, or write {_FORM}"
+        )
+    values = table.values
+    position = np.full((len(values), 3), np.nan)
+    for k, column in enumerate(places):
+        if column is not None:
+            scale = 180.0 / np.pi if k < 2 and _RADIANS.search(table.header[1 + column]) else 1.0
+            position[:, k] = scale * values[:, column]
+    times_ns = stamps_ns(table, _FIX_PACE, notes)
+    fixed = _have_a_fix(table)
+    if not fixed.all():
+        notes.append(f"{path}: {int((~fixed).sum())} rows say that there is no fix")
+    return checked_fixes(
+        times_ns[fixed], position[fixed], _covariance_in(table)[fixed], str(path), tuple(notes)
+    )
+
+
+def _places_in(header: Sequence[str]) -> tuple[int, int, int | None] | None:
+    """Return which columns behind the stamp are latitude, longitude and height (None: there is none);
+    None: no header names both of the former, or several columns do.
+    """
+    found = [
+        [
+            k
+            for k, name in enumerate(header[1:])
+            if place.search(name) and not _NO_PLACE.search(name)
+        ]
+        for place in _PLACES
+    ]
+    latitude, longitude, height = found
+    if len(latitude) != 1 or len(longitude) != 1:
+        return None
+    return latitude[0], longitude[0], height[0] if len(height) == 1 else None
+
+
+def _have_a_fix(table: NumberTable) -> BoolArray:
+    """Return which rows (N,) have a fix by the status of their NavSatFix; all: none is stated."""
+    status = [k for k, name in enumerate(table.header[1:]) if _STATUS.search(name)]
+    if len(status) != 1:
+        return np.ones(len(table.values), dtype=np.bool_)
+    return table.values[:, status[0]] != _NO_FIX
+
+
+def _covariance_in(table: NumberTable) -> FloatArray:
+    """Return the covariance (N, 3, 3) of east, north and up, m^2, by nine columns; NaN: there are
+    none.
+    """
+    names = [_COVARIANCE.search(name) for name in table.header[1:]]
+    columns = [k for k, name in enumerate(names) if name]
+    if len(columns) != 9:
+        return np.full((len(table.values), 3, 3), np.nan)
+    return table.values[:, columns].reshape(-1, 3, 3)
 
 
 def _order(header: Sequence[str]) -> tuple[int, int] | None:

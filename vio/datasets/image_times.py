@@ -19,7 +19,7 @@ from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImagePairs
 from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.lost_images import CountedApart
-from vio.datasets.sides import without_side
+from vio.datasets.sides import frame_words, side_word, without_side
 from vio.datasets.tables import drive_times, is_date, table_rows
 from vio.datasets.unused import Layout
 from vio.errors import DataError
@@ -32,6 +32,10 @@ from vio.records import NS_PER_S, IntArray
 _MIN_LEFT_OUT = 10  # numbers between the last image and the first one of such a recording
 _MIN_FULL = 999  # the largest number of a camera's counter has so many nines, or more
 TIME_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "left_images.txt")
+# in the names of lists that are not of the images
+_OTHER_SENSORS = frozenset(
+    ("imu", "gyro", "accel", "gps", "gnss", "lidar", "velodyne", "depth", "events", "pose", "poses")
+)
 _LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
 _TIMED = 100  # images, of which names that are times show it
 _LIST_FORM = "timestamp [ns], filename"
@@ -219,11 +223,18 @@ def _own_times(files: ImageFiles, other: Path) -> IntArray | None:
 
 def _keys_in_names(lefts: ImageFiles, rights: ImageFiles) -> list[list[str | int]]:
     """Return the names without their sides where some are shared then, else their last numbers."""
-    keys: list[list[str | int]]
-    keys = [[without_side(p.stem) for p in files] for files in (lefts, rights)]
-    if not set(keys[0]) & set(keys[1]):
-        keys = [[_last_number(p) for p in files] for files in (lefts, rights)]
-    return keys
+    for key_of in (without_side, _frame_of):
+        keys: list[list[str | int]] = [
+            [key_of(stem_of(name)) for name in files.names] for files in (lefts, rights)
+        ]
+        if set(keys[0]) & set(keys[1]):
+            return keys
+    return [[_last_number(p) for p in files] for files in (lefts, rights)]
+
+
+def _frame_of(stem: str) -> str:
+    """Return the words of an image's name without that of its side, separated by spaces."""
+    return " ".join(frame_words(stem))
 
 
 def _keys_of_times(left_ns: IntArray, right_ns: IntArray) -> list[list[str | int]]:
@@ -324,6 +335,13 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
     if file is not None:
         times_ns = times_of(file, pairs, doubts)
         return times_ns, file, (*doubts, *_slow_note(file, times_ns))
+    return _unlisted_times(layout, pairs, doubts)
+
+
+def _unlisted_times(
+    layout: Layout, pairs: ImagePairs, doubts: list[str]
+) -> tuple[IntArray, Path | None, tuple[str, ...]]:
+    """Return times, their source and notes as `frame_times`, where no list has a usual name."""
     lefts = [left for left, _ in pairs]
     file = layout.left.parent / "data.csv"
     missing: tuple[str, ...] = ()
@@ -341,6 +359,9 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
         raise DataError(
             f"{file}: does not list {unlisted} ({_LIST_FORM}); copy both again, or remove the image"
         )
+    found = _list_of_another_name(layout, pairs)
+    if found is not None:
+        return found
     counts = _frame_counts(lefts)
     holes = int(counts[-1]) + 1 - len(counts)
     counted = f" (with the {holes} that the numbers leave out)" if holes else ""
@@ -434,6 +455,44 @@ def _file_of_times(layout: Layout) -> Path | None:
     folders = dict.fromkeys((layout.base, layout.root, *beside))
     named = (folder / name for folder in folders for name in TIME_LISTS)
     return next((file for file in named if file.is_file()), None)
+
+
+def _list_of_another_name(
+    layout: Layout, pairs: ImagePairs
+) -> tuple[IntArray, Path, tuple[str, ...]] | None:
+    """Return the times (F,) of the list that names itself one of times, and has one for each image
+    (`image_timestamps_left.txt`), the file and a note; None: there is none, or several that differ.
+
+    Of lists of both cameras the left one's counts.
+    """
+    folders = dict.fromkeys((layout.left, *layout.above(layout.left), layout.base, layout.root))
+    files = (file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir()))
+    listed = [file for file in files if _is_named_list(file)]
+    found: dict[Path, IntArray] = {}
+    for file in listed:
+        with contextlib.suppress(DataError):
+            found[file] = times_of(file, pairs)
+    if not found:
+        return None
+    file, times_ns = next(iter(found.items()))
+    if any(not np.array_equal(other, times_ns) for other in found.values()):
+        return None
+    note = f"{file}: taken for the times of the images, of which it has one each"
+    return times_ns, file, (note, *_slow_note(file, times_ns))
+
+
+def _is_named_list(file: Path) -> bool:
+    """Tell whether a file is a table whose name says that it holds times, of no other sensor and not
+    of the right camera.
+    """
+    if file.suffix.lower() not in (".txt", ".csv") or not file.is_file():
+        return False
+    words = re.findall(r"[a-z]+", file.stem.lower())
+    return (
+        any(re.fullmatch("time|times|(?:time)?stamps?", word) for word in words)
+        and not set(words) & _OTHER_SENSORS
+        and side_word(file.stem) != "right"
+    )
 
 
 def _slow_note(file: Path, times_ns: IntArray) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from vio.datasets.tables import NumberTable, in_order, sensor_of, stamps_ns
 from vio.errors import DataError
-from vio.files.stamps import SAMPLE_PACE
+from vio.files.stamps import FRAME_PACE, SAMPLE_PACE, parse_stamps
 from vio.files.text import lines_of
 from vio.geometry.lie import FloatArray
 from vio.imu.sampling import sampling_notes
@@ -65,7 +65,45 @@ def read_imu_lines(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
     return record, (*notes, *sampling_notes(record, str(path)))
 
 
+def read_frame_times(path: Path) -> IntArray:
+    """Read the times (F,) of the frames of Spectacular AI's `data.jsonl`, whose lines
+    `{"frames": [{"cameraInd": 0, "time": s}, ...], "time": s}` are in the order of its videos; that of
+    the first camera where it has its own.
+
+    Raises:
+        DataError: a line is no JSON, or the times do not increase.
+    """
+    found = []
+    for number, entry in _entries(path, []):
+        frames = entry.get("frames")
+        if not isinstance(frames, list):
+            continue
+        first = next((f for f in frames if isinstance(f, dict) and f.get("cameraInd") == "0"), {})
+        stamp = first.get("time", entry.get("time"))
+        if isinstance(stamp, str):
+            found.append((number, stamp))
+    stamps = [stamp for _, stamp in found]
+    return parse_stamps(stamps, lambda k: f"{path}, line {found[k][0]}", "s", pace=FRAME_PACE)
+
+
 def _readings(path: Path, notes: list[str]) -> Iterator[_Reading]:
+    for number, entry in _entries(path, notes):
+        key = next((key for key in _TIMES if isinstance(entry.get(key), str)), None)
+        if key is None:
+            continue
+        for name, values in _vectors(entry):
+            sensor = sensor_of(name)
+            if sensor:
+                yield _Reading(sensor, key, entry[key], values, number)
+
+
+def _entries(path: Path, notes: list[str]) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield the number and the object of each line that holds one, its numbers as text; a last line
+    that was cut is noted.
+
+    Raises:
+        DataError: another line is no JSON.
+    """
     fault: DataError | None = None  # of the line before, which may be the last one
     is_first = True
     for number, line in lines_of(path):
@@ -84,15 +122,8 @@ def _readings(path: Path, notes: list[str]) -> Iterator[_Reading]:
                 raise fault from error
             continue
         is_first = False
-        if not isinstance(entry, dict):
-            continue
-        key = next((key for key in _TIMES if isinstance(entry.get(key), str)), None)
-        if key is None:
-            continue
-        for name, values in _vectors(entry):
-            sensor = sensor_of(name)
-            if sensor:
-                yield _Reading(sensor, key, entry[key], values, number)
+        if isinstance(entry, dict):
+            yield number, entry
     if fault is not None:
         notes.append(f"{path}: the last line was cut, and is left out")
 

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.cameras.rig import Rig
-from vio.datasets.common import begins_as_zip, read_npz, shape_text
+from vio.datasets.common import begins_as_zip, naming, read_npz, shape_text
 from vio.datasets.feature_forms import features_doubt, features_fault, without_placeholders
 from vio.datasets.features import FeatureDataset
 from vio.datasets.reader import Reader
@@ -291,7 +291,8 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
     tracks = FeatureTracks(
         dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"], sigma
     )
-    camera = _camera(arrays)
+    with naming(path):
+        camera = _camera(arrays)
     notes = tuple(str(note) for note in arrays["notes"])
     if is_foreign:
         tracks, found = _examined(tracks, camera, path)
@@ -359,7 +360,10 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> None:
     """Raise DataError where an array is missing, or has another type or other dimensions."""
     for key in _REQUIRED:
         if key not in arrays:
-            raise DataError(f"{path}: the observation log lacks {key}; write it again")
+            raise DataError(
+                f"{path}: the observation log lacks {key}; vio.write_observations writes all that is "
+                "needed"
+            )
     for key, (kind, dimensions) in _KINDS.items():
         if key in arrays and (arrays[key].dtype.kind != kind or arrays[key].ndim != dimensions):
             least = "one value" if dimensions == 0 else f"{dimensions}-D"
@@ -479,8 +483,13 @@ def _lost_digits(times_ns: IntArray) -> str:
 
 def _of_camera(arrays: Mapping[str, np.ndarray]) -> str | None:
     """Whether the camera is complete."""
-    if arrays["intrinsics"].shape != (5,) or len(arrays["image_size"]) not in (0, 2):
-        return "the camera is incomplete"
+    if arrays["intrinsics"].shape != (5,):
+        return (
+            f"intrinsics has {len(arrays['intrinsics'])} numbers, not the five fu fv cu cv and the "
+            "baseline in metres"
+        )
+    if len(arrays["image_size"]) not in (0, 2):
+        return f"image_size is {arrays['image_size'].tolist()}, not width and height"
     residual = arrays.get("residual_px", np.zeros(()))
     if not 0 <= residual < np.inf:
         return f"residual_px is {residual.tolist()!r}, no number of pixels"

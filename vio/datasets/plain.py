@@ -62,7 +62,7 @@ from vio.datasets.rigs.eth3d import FOLDERS as ETH3D_FOLDERS
 from vio.datasets.rigs.eth3d import is_eth3d
 from vio.datasets.rigs.names import named_calibration
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.sides import first_pair, pairs_of, split_sides
+from vio.datasets.sides import first_pair, pairs_of, split_sides, stamped_sides
 from vio.datasets.tables import drive_times
 from vio.datasets.tum_rgbd import (
     DEPTH_FACTOR,
@@ -178,20 +178,41 @@ def side_by_side(path: Path, calibration: Path | None = None) -> Layout | None:
 def _pair_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
     """Return where the images of both cameras lie in one folder, by names that tell them apart, and
     the images; None: there are none.
+
+    Raises:
+        DataError: each image has a time or number of its own, and those of the cameras fit none of
+            each other's.
     """
     layout = _layout_of_one(path)
     if layout is None and _holds_images(path):
         layout = Layout(path, path, path, path)
     if layout is None:
+        layout = _only_folder(path)
+    if layout is None:
         return None
     files = list_images(layout.left)
     sides = split_sides(files.names)
     if sides is None:
-        return None
+        sides = stamped_sides(files.names)
+        if sides is None:
+            return None
+        lefts, rights = (ImageFiles(files.folder, tuple(names)) for names in sides)
+        return layout, _Images(*pair_files(lefts, rights))
     pairs = FilePairs(*(ImageFiles(files.folder, tuple(names)) for names in sides))
     alone = len(files) - 2 * len(pairs)
     lone = (f"{alone} images have no partner and are skipped",) if alone else ()
     return layout, _Images(pairs, lone)
+
+
+def _only_folder(path: Path) -> Layout | None:
+    """Return the layout of the one folder below a folder that holds images, whatever its name; None:
+    there are none, or several.
+    """
+    found = list(image_folders(path))
+    if len(found) != 1:
+        return None
+    images = path / found[0]
+    return Layout(path, images.parent, images, images)
 
 
 def _named_layout(path: Path, folders: str) -> Layout:
@@ -285,8 +306,10 @@ def images_of_one_camera(path: Path) -> Path | None:
 def is_mono_folder(path: Path) -> bool:
     """Return whether a folder holds the images of one camera, and a calibration identifies them."""
     layout = _layout_of_one(path)
-    if layout is not None and split_sides(list_images(layout.left).names) is not None:
-        return False
+    if layout is not None:
+        names = list_images(layout.left).names
+        if split_sides(names) is not None or stamped_sides(names) is not None:
+            return False
     return layout is not None and calibration_beside(layout) is not None
 
 
@@ -694,7 +717,10 @@ def _frame_numbers(pairs: ImagePairs) -> IntArray:
 
 
 def _is_both_in_one(path: Path) -> bool:
-    return _pair_in_one_folder(path) is not None or side_by_side(path) is not None
+    try:
+        return _pair_in_one_folder(path) is not None or side_by_side(path) is not None
+    except DataError:  # of two cameras, but in no pairs, as the reader says
+        return True
 
 
 def _is_mono_of_euroc(path: Path) -> bool:

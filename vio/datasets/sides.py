@@ -18,7 +18,8 @@ _SIDES = (
     ("2", "3"),
     ("a", "b"),
 )
-_CAMERAS = ("cam", "camera", "infra", "fisheye")  # whose number tells them apart
+_CAMERAS = ("cam", "camera", "infra", "infrared", "fisheye")  # whose number tells them apart
+_COUNTED = (("0", "1"), ("1", "2"))  # how cameras are numbered, left first
 _IMAGES = ("image", "img")  # likewise, where a number of the frame follows
 _WORDS = re.compile(r"\d+|[A-Z]?[a-z]+|[A-Z]+(?![a-z])|/|\\")
 
@@ -71,35 +72,73 @@ def split_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
     None: they are not of two cameras. A word for a side tells them apart, or the number of a
     camera (`frame01_cam0`); those of one side without the other are left out.
     """
-    frames: dict[tuple[str, ...], dict[str, str]] = {}
-    for name in names:
-        found = _frame_and_side(name)
-        if found is None:
-            return None
-        frame, side = found
-        sides = frames.setdefault(frame, {})
-        if side in sides:
-            return None
-        sides[side] = name
+    for numbers in _COUNTED:
+        frames: dict[tuple[str, ...], dict[str, str]] = {}
+        for name in names:
+            found = _frame_and_side(name, numbers)
+            if found is None or found[1] in frames.setdefault(found[0], {}):
+                break
+            frames[found[0]][found[1]] = name
+        else:
+            return _in_pairs(frames, len(names))
+    return None
+
+
+def _in_pairs(
+    frames: dict[tuple[str, ...], dict[str, str]], count: int
+) -> tuple[list[str], list[str]] | None:
+    """Return the left and the right names of the frames that have both; None: they are few of all."""
     pairs = [sides for sides in frames.values() if len(sides) == 2]
-    alone = len(names) - 2 * len(pairs)
+    alone = count - 2 * len(pairs)
     if not pairs or alone > len(pairs):
         return None
     return [pair["left"] for pair in pairs], [pair["right"] for pair in pairs]
 
 
-def _frame_and_side(name: str) -> tuple[tuple[str, ...], str] | None:
+def stamped_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
+    """Return the names of left and right images that lie in one folder, where each has a word for its
+    side and a time or number of its own (`front_left_0_1600000000250000000`); None: some have
+    none, or one side has less than half of the other.
+    """
+    sides: dict[str, list[str]] = {"left": [], "right": []}
+    for name in names:
+        found = _frame_and_side(name, ())
+        if found is None:
+            return None
+        sides[found[1]].append(name)
+    fewest, most = sorted(map(len, sides.values()))
+    if 2 * fewest < most:
+        return None
+    return sides["left"], sides["right"]
+
+
+def frame_words(stem: str) -> tuple[str, ...] | str:
+    """Return the words of an image's name without the side that one of them states, also as a part of
+    it (`000003_leftImg8bit`); the name where none does.
+    """
+    found = _frame_and_side(stem, ())
+    return stem if found is None else found[0]
+
+
+def _frame_and_side(name: str, numbers: tuple[str, ...]) -> tuple[tuple[str, ...], str] | None:
     """Return the words of an image's name but the first that names a side, and this side.
 
     A word does before the number of a camera, which may be that of a stereo camera
     (`img_CAMERA1_17_left`).
+
+    Args:
+        name: of the image.
+        numbers: of the left and the right camera; none: words alone tell.
     """
     words = words_of(os.path.splitext(name)[0])
-    for side_at in (_side_of_word, _side_of_camera):
-        for k in range(len(words)):
-            side = side_at(words, k)
-            if side is not None:
-                return (*words[:k], "", *words[k + 1 :]), side
+    for k in range(len(words)):
+        side = _side_of_word(words, k)
+        if side is not None:
+            return (*words[:k], "", *words[k + 1 :]), side
+    for k in range(len(words)):
+        side = _side_of_camera(words, k, numbers)
+        if side is not None:
+            return (*words[:k], "", *words[k + 1 :]), side
     return None
 
 
@@ -111,13 +150,13 @@ def _side_of_word(words: tuple[str, ...], k: int) -> str | None:
     return None
 
 
-def _side_of_camera(words: tuple[str, ...], k: int) -> str | None:
+def _side_of_camera(words: tuple[str, ...], k: int, numbers: tuple[str, ...]) -> str | None:
     """Return the side that the number of a camera in a name states; None: it states none."""
-    if not k or words[k] not in ("0", "1"):
+    if not k or words[k] not in numbers:
         return None
     counted = words[k + 1 : k + 2] and words[k + 1].isdigit()  # image_0_17: camera, number
     if words[k - 1] in _CAMERAS or (counted and words[k - 1] in _IMAGES):
-        return "left" if words[k] == "0" else "right"
+        return "left" if words[k] == numbers[0] else "right"
     return None
 
 

@@ -570,6 +570,13 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
     return _columns_of(table, order)
 
 
+def read_logged_table(path: Path, form: str, cut: list[str] | None = None) -> NumberTable:
+    """Read all columns of a table of messages or of a logger, with the time that its header names in
+    front; see `read_table`.
+    """
+    return _time_first(read_table(path, _columns(path), form, cut))
+
+
 def _known_header(table: NumberTable) -> tuple[str, ...]:
     """Return the names of the columns of a table without a header: of messages `sensor_msgs/Imu` as
     `ros2 topic echo --csv` writes them, which begin with seconds, nanoseconds and the name of a

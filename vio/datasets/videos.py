@@ -43,7 +43,9 @@ _NAMES = (
     ("cam0", "cam1"),
     ("image_0", "image_1"),
     ("video_0", "video_1"),
+    ("data", "data2"),  # of Spectacular AI's recordings
 )
+_FRAMES = "data.jsonl"  # that holds the times of the latter
 # of the name of a list, what is no video's: `left_timestamps.csv`, `timestamps-left.txt`
 _LIST_WORDS = re.compile(r"time[-_ ]?stamps?|times?|stamps?|frames?|[-_. ]", re.IGNORECASE)
 _LIST_SUFFIXES = (".txt", ".csv")
@@ -75,18 +77,30 @@ class _Facts:
 def video_files(path: Path) -> tuple[Path, Path] | None:
     """Return the left and right video file of a folder, twice the same where there is one alone;
     None: it has none, or several that are no pair.
+
+    Each may be the only video in a folder of its own (`left/video.mp4 right/video.mp4`).
     """
-    found = {
-        child.stem: child for child in sorted(path.iterdir()) if child.suffix.lower() in SUFFIXES
-    }
+    found = {video.stem: video for video in _videos_in(path)}
+    if not found:
+        for names in _NAMES:
+            inside = [_videos_in(path / name) for name in names]
+            if all(len(videos) == 1 for videos in inside):
+                return inside[0][0], inside[1][0]
+        return None
     if len(found) == 1:
         (alone,) = found.values()
         return alone, alone
-    pairs = pairs_of(list(found))
-    known = [pair for pair in pairs if pair in _NAMES] or pairs
+    known = [pair for pair in _NAMES if set(pair) <= set(found)] or pairs_of(list(found))
     if len(known) == 1:
         return (found[known[0][0]], found[known[0][1]])
     return None
+
+
+def _videos_in(folder: Path) -> list[Path]:
+    """Return the videos of a folder by name; none: it has none, or is no folder."""
+    if not folder.is_dir():
+        return []
+    return [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES]
 
 
 def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
@@ -108,6 +122,7 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     one = files[0] == files[1]
     own = None if one else _own_lists(path, files)
     timed = own is not None or left.times_ns is not None or right.times_ns is not None
+    timed = timed or _times_of_frames(path, files) is not None
     if not timed and abs(left.rate_hz - right.rate_hz) > 1e-3 * left.rate_hz:
         raise DataError(
             f"{files[0]} has {left.rate_hz:g} and {files[1].name} {right.rate_hz:g} frames per "
@@ -259,6 +274,15 @@ def _times(
         return times_ns, file, rows, doubts + shorter
     if own is not None:
         return _times_of_own_lists(path, files, facts, own)
+    stated_ns = _times_of_frames(path, files)
+    if stated_ns is not None:
+        notes = list(shorter)
+        if len(stated_ns) != count:
+            notes.append(
+                f"{_FRAMES} has {len(stated_ns)} frames, the videos {count}; the first ones count"
+            )
+        count = min(count, len(stated_ns))
+        return stated_ns[:count], path / _FRAMES, rows[:count], notes
     if left.times_ns is not None or right.times_ns is not None:
         return _uneven_times(files, facts)
     if left.rate_hz == 0.0:
@@ -268,6 +292,19 @@ def _times(
     note = f"no times.txt: frames are {1e3 / left.rate_hz:.4g} ms apart, as {files[0].name} states; real cameras jitter"
     times_ns = np.rint(np.arange(count) * (NS_PER_S / left.rate_hz)).astype(np.int64)
     return times_ns, None, rows, [note, *shorter]
+
+
+def _times_of_frames(path: Path, files: tuple[Path, Path]) -> IntArray | None:
+    """Return the times (F,) of the frames of a recording of Spectacular AI; None: it is another, or
+    states none.
+    """
+    file = path / _FRAMES
+    if files[0].stem != _NAMES[-1][0] or not file.is_file():
+        return None
+    from vio.datasets.json_lines import read_frame_times
+
+    times_ns = read_frame_times(file)
+    return times_ns if len(times_ns) else None
 
 
 def _listed_times(file: Path, frames: int, doubts: list[str]) -> IntArray:

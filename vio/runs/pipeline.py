@@ -545,7 +545,10 @@ class _Loop:
 
 
 def _check_range(recording: Recording, start: int, stop: int | None) -> None:
-    """Raise ConfigError where a range of frames is empty."""
+    """Raise ConfigError where a range of frames is empty, or its ends are no whole numbers."""
+    for end in (start, stop):
+        if end is not None and not isinstance(end, int | np.integer):
+            raise ConfigError(f"start and stop are numbers of frames, not {end!r}")
     if start < 0 or (stop is not None and stop <= start):
         last = "the last one" if stop is None else stop
         raise ConfigError(f"frames {start} to {last} are no range; give 0 <= start < stop")

@@ -4,6 +4,7 @@ another hand.
 
 from __future__ import annotations
 
+import difflib
 import json
 import logging
 from collections.abc import Mapping
@@ -237,10 +238,7 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
                 f"{folder}: is a map, not a run; give the folder of a run with it (vio run --map), or "
                 "show the map by vio map show"
             )
-        raise DataError(
-            f"{folder}: no run folder (it has no {RunFile.METRICS}); give a folder that `vio run` "
-            "wrote"
-        )
+        raise DataError(_no_run(folder))
     metrics = read_stated(path, METRICS_SHAPE, "repeat the run")
     try:
         T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
@@ -252,6 +250,33 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
             folder,
         )
     return metrics, checked_transform(T_cam0_imu, f"{path}, T_cam0_imu")
+
+
+def _no_run(path: Path) -> str:
+    """Say that a path is no run's folder, and which may be meant: the one that a file lies in, one in
+    the folder, or one of a name like it.
+    """
+    wanted = "give a folder that `vio run` wrote"
+    if not path.exists():
+        beside = path.absolute().parent
+        names = [run.name for run in _runs_in(beside)]
+        near = difflib.get_close_matches(path.name, names, 1)
+        hint = f"did you mean {path.parent / near[0]}?" if near else wanted
+        return f"{path} does not exist; {hint}"
+    if path.is_file() and (path.parent / RunFile.METRICS).is_file():
+        return f"{path}: is a file of a run; give the folder of the run, {path.parent}"
+    held = [str(path / run.name) for run in _runs_in(path)]
+    if held:
+        return f"{path}: holds the results of runs; give one of them, such as {held[0]}"
+    return f"{path}: no run folder (it has no {RunFile.METRICS}); {wanted}"
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    """Return the folders of runs in a folder, by name; none: it is no folder, or cannot be listed."""
+    try:
+        return sorted(run.parent for run in folder.glob(f"*/{RunFile.METRICS}"))
+    except OSError:
+        return []
 
 
 def _parted(values: dict[str, Any]) -> str | None:

@@ -1,0 +1,181 @@
+"""Layouts of public data sets and of other programs' exports, and what is given in the place of a
+recording.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vio
+from tests.plain_maker import STEP_S, make_plain
+from vio.datasets import open_dataset
+from vio.datasets.image_pairs import ImageDataset
+from vio.errors import CalibrationError, DataError
+
+FIRST_NS = 1700000000_000000000
+
+
+def paired_names(dataset: object) -> list[tuple[str, str]]:
+    """Return the names of the images of each pair."""
+    assert isinstance(dataset, ImageDataset)
+    return [(left.name, right.name) for left, right in dataset.pairs]
+
+
+def in_one_folder(
+    path: Path, folder: str, name: Callable[[int, int], str], frames: int = 5
+) -> Path:
+    """Write a plain recording whose images all lie in one folder."""
+    make_plain(path, frames, name=name, times=False, imu=False, reference=False)
+    (path / folder).mkdir(parents=True)
+    for side in ("left", "right"):
+        for image in (path / side).iterdir():
+            image.rename(path / folder / image.name)
+        (path / side).rmdir()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("folder", "left", "right"),
+    [
+        ("images", "infra1_{k:04d}.png", "infra2_{k:04d}.png"),
+        ("images", "{k:04d}_cam1.png", "{k:04d}_cam2.png"),
+        ("render", "{k:04d}_L.png", "{k:04d}_R.png"),
+    ],
+)
+def test_pairs_in_one_folder_are_found_by_their_names(
+    folder: str, left: str, right: str, tmp_path: Path
+) -> None:
+    path = in_one_folder(tmp_path, folder, lambda side, k: (left, right)[side].format(k=k))
+    dataset = open_dataset(path)
+    assert dataset.recording.kind == "plain"
+    assert paired_names(dataset) == [(left.format(k=k), right.format(k=k)) for k in range(5)]
+
+
+def stamped(side: int, k: int, apart_ns: int) -> str:
+    """Return the name of an image as a simulator gives it: vehicle, camera, kind, time."""
+    words = ("left", "right")[side]
+    return f"img_Drone_front_{words}_0_{FIRST_NS + k * 50_000_000 + side * apart_ns}.png"
+
+
+def test_pairs_in_one_folder_may_have_times_of_their_own(tmp_path: Path) -> None:
+    path = in_one_folder(tmp_path, "images", lambda side, k: stamped(side, k, 2_000_000))
+    dataset = open_dataset(path)
+    assert dataset.recording.kind == "plain"
+    expected = [tuple(stamped(side, k, 2_000_000) for side in (0, 1)) for k in range(5)]
+    assert paired_names(dataset) == expected
+    assert (np.diff(dataset.recording.frame_times_ns) == 50_000_000).all()
+
+
+def test_images_of_two_cameras_that_fit_in_no_pairs_are_not_those_of_one(tmp_path: Path) -> None:
+    path = in_one_folder(tmp_path, "images", lambda side, k: stamped(side, k, 20_000_000))
+    with pytest.raises(DataError, match=r"20 ms apart \(right from left, median\)"):
+        open_dataset(path)
+
+
+def test_a_number_in_the_word_of_a_side_is_no_frame(tmp_path: Path) -> None:
+    names = ("town_000000_{k:06d}_leftImg8bit.png", "town_000000_{k:06d}_rightImg8bit.png")
+    make_plain(
+        tmp_path, 4, folders=("leftImg8bit", "rightImg8bit"),
+        name=lambda side, k: names[side].format(k=k), imu=False,
+    )  # fmt: skip
+    (tmp_path / "rightImg8bit" / names[1].format(k=2)).unlink()
+    dataset = open_dataset(tmp_path)
+    kept = [tuple(name.format(k=k) for name in names) for k in (0, 1, 3)]
+    assert paired_names(dataset) == kept
+
+
+def with_list(path: Path, name: str, rows: int) -> Path:
+    """Write a plain recording whose list of times, in microseconds, has another name."""
+    make_plain(path, 4, times=False, imu=False)
+    file = path / name
+    file.write_text("".join(f"{FIRST_NS // 1000 + 50_000 * k}.000\n" for k in range(rows)))
+    return path
+
+
+@pytest.mark.parametrize("name", ["left/image_timestamps_left.txt", "image_times.txt"])
+def test_a_list_of_times_may_have_another_name(name: str, tmp_path: Path) -> None:
+    recording = open_dataset(with_list(tmp_path, name, 4)).recording
+    expected = FIRST_NS + (np.arange(4) * STEP_S * 1e9).astype(np.int64)
+    np.testing.assert_array_equal(recording.frame_times_ns, expected)
+    assert any(f"{tmp_path / name}: taken for the times" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "rows"),
+    [
+        ("image_times.txt", 3),
+        ("imu_timestamps.txt", 4),
+        ("right/timestamps_right.txt", 4),
+        ("exposures.txt", 4),
+    ],
+)
+def test_other_lists_are_not_taken_for_times(name: str, rows: int, tmp_path: Path) -> None:
+    recording = open_dataset(with_list(tmp_path, name, rows)).recording
+    assert int(recording.frame_times_ns[1]) == 100_000_000
+    assert any("no times.txt" in note for note in recording.notes)
+
+
+def test_lists_that_differ_are_not_taken_for_times(tmp_path: Path) -> None:
+    path = with_list(tmp_path, "image_times.txt", 4)
+    (path / "sync_times.txt").write_text("".join(f"{0.1 * k + 5}\n" for k in range(4)))
+    assert int(open_dataset(path).recording.frame_times_ns[0]) == 0
+
+
+@pytest.mark.parametrize("name", ["f.csv", "f.txt", "f.json", "f.pkl", "f.npy"])
+def test_features_of_another_form_are_told_how_to_become_a_recording(
+    name: str, tmp_path: Path
+) -> None:
+    rows = np.arange(12.0).reshape(2, 6)
+    file = tmp_path / name
+    if name.endswith(".npy"):
+        np.save(file, rows)
+    else:
+        file.write_text("frame,id,ul,vl,ur,vr\n0,1,2,3,4,5\n")
+    with pytest.raises(DataError, match=rf"{name}: .* one by vio\.write_observations"):
+        open_dataset(file)
+
+
+def test_a_folder_of_images_of_any_name_is_named(tmp_path: Path) -> None:
+    make_plain(tmp_path, 3, imu=False)
+    (tmp_path / "left").rename(tmp_path / "results")
+    shutil.rmtree(tmp_path / "right")
+    with pytest.raises(DataError, match=r"holds images in results, .* into left and right"):
+        open_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("source", [None, ["a", "b"], b"a", 3])
+def test_a_source_is_one_path(source: object) -> None:
+    with pytest.raises(DataError, match=r"named by one path, as text or pathlib\.Path, not by"):
+        open_dataset(source)  # type: ignore[arg-type] # what is refused
+
+
+@pytest.mark.parametrize(
+    ("centre", "size", "said"),
+    [
+        ((180.0, 600.0), (1200, 370), "are exchanged"),
+        ((600.0, 180.0), (370, 1200), "are exchanged"),
+        ((600.0, 180.0), (1200, 370), None),
+        ((-20.0, 180.0), (1200, 370), None),  # as of a part that was cut out of an image
+    ],
+)
+def test_a_principal_point_of_exchanged_numbers_is_refused(
+    centre: tuple[float, float], size: tuple[int, int], said: str | None
+) -> None:
+    K = np.array([[700.0, 0, centre[0]], [0, 700.0, centre[1]], [0, 0, 1]])
+    T_cam1_cam0 = np.eye(4)
+    T_cam1_cam0[0, 3] = -0.5
+    makers = (
+        lambda: vio.Rig.rectified(700.0, 700.0, *centre, 0.5, *size),
+        lambda: vio.Rig.raw(K, K, T_cam1_cam0, *size),
+    )
+    for make in makers:
+        if said is None:
+            assert (make().cam0.cu, make().cam0.cv) == centre
+        else:
+            with pytest.raises(CalibrationError, match=said):
+                make()
