@@ -13,7 +13,15 @@ import numpy as np
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.numerics.kinds import Capacity
-from vio.records import S_PER_NS, Estimate, ImuSample, MotionSample, VelocitySample, imu_matrices
+from vio.records import (
+    NS_PER_S,
+    S_PER_NS,
+    Estimate,
+    ImuSample,
+    MotionSample,
+    VelocitySample,
+    imu_matrices,
+)
 
 
 class _PredictionRules(NamedTuple):
@@ -104,8 +112,7 @@ class PosePredictor:
             omega,
             _ZERO,
         )
-        before = [sample for sample in self._samples if sample.time_ns <= estimate.time_ns]
-        states = [self._held(state, before[-1]) if before else state]
+        states = [self._with_sample(state)]
         for sample in self._samples:
             if sample.time_ns > estimate.time_ns:
                 states.append(self._carried(states[-1], sample))
@@ -135,6 +142,17 @@ class PosePredictor:
         state = next(state for state in reversed(states) if state.time_ns <= time_ns)
         R, p, v = _moved(state, min((time_ns - state.time_ns) * S_PER_NS, _PREDICTION.max_step_s))
         return PredictedPose(time_ns, se3_from_parts(R, p), v)
+
+    def _with_sample(self, state: _State) -> _State:
+        """The state of an estimate with the motion of the newest sample up to it.
+
+        Where the sensor is silent, or is not used any more, the motion stays that of the estimates.
+        """
+        before = [sample for sample in self._samples if sample.time_ns <= state.time_ns]
+        longest_ns = round(_PREDICTION.max_step_s * NS_PER_S)
+        if not before or state.time_ns - before[-1].time_ns > longest_ns:
+            return state
+        return self._held(state, before[-1])
 
     def _motion_of(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
         """Body rate (3,) rad/s and world velocity (3,) m/s at an estimate, from the last two
