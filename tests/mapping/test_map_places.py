@@ -181,6 +181,23 @@ def test_a_darker_right_camera_leaves_the_disparities_exact() -> None:
     assert max(errors) < 0.1
 
 
+def test_features_of_one_corner_agree_from_near_and_from_afar() -> None:
+    """An image in half the size shows each corner on other levels, at half its pixel as counted
+    from the image's edge.
+    """
+    rng = np.random.default_rng(5)
+    small = rng.uniform(20, 230, (90, 150)).astype(np.float32)
+    near = cv2.resize(small, (900, 540), interpolation=cv2.INTER_CUBIC)
+    afar = cv2.resize(near, (450, 270), interpolation=cv2.INTER_AREA)
+    a, b = (extract(*[np.clip(image, 0, 255).astype(np.uint8)] * 2) for image in (near, afar))
+    i, j = match(a, b).T
+    apart = a.z[i, :2] - (2 * b.z[j, :2] + 0.5)
+    same = np.abs(apart).max(axis=1) < 6
+    assert same.sum() > 100
+    assert np.abs(np.median(apart[same], axis=0)).max() < 0.25
+    assert np.abs(apart[same].mean(axis=0)).max() < 0.25
+
+
 @pytest.mark.parametrize("size", [(64, 64), (180, 320)])
 def test_an_image_without_texture_has_no_features(size: tuple[int, int]) -> None:
     gray = np.full(size, 90, dtype=np.uint8)
