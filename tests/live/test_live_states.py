@@ -329,6 +329,22 @@ def test_a_silent_imu_is_not_held_for_ever() -> None:
             assert moved[1, 0] == pytest.approx(0.0, abs=1e-9)
 
 
+def test_predictions_take_the_offset_of_the_clocks_into_account() -> None:
+    """A body whose rate of turn changes; its IMU's clock is 40 ms ahead, as the filter has found."""
+    live = PosePredictor(9.81)
+    offset_ns = 40_000_000
+    for k in range(60):
+        t = 5e-3 * k
+        gyro = np.array([0.0, 0.0, 20.0 * t])
+        live.sample(ImuSample(k * 5_000_000 + offset_ns, gyro, np.array([0.0, 0.0, 9.81])))
+    here = Estimate(
+        100_000_000, np.eye(4), np.eye(6), velocity_world=np.zeros(3), time_offset_s=0.04
+    )
+    live.estimate(here)
+    turn = so3_log(live.predict(200_000_000).T_world_imu[:3, :3])[2]
+    assert turn == pytest.approx(10.0 * (0.2**2 - 0.1**2), abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("verdict", "rate"),
     [(ImuVerdict(gyro_factor=np.radians(1.0)), 0.5), (ImuVerdict(usable=False), 0.0)],

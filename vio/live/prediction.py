@@ -64,7 +64,8 @@ def _time_ns(state: _State) -> int:
 
 
 class PosePredictor:
-    """Carries the newest estimate over the motion samples after it.
+    """Carries the newest estimate over the motion samples after it, on the camera's clock: samples
+    are moved by the offset of the clocks where the filter estimates it.
 
     IMU: strapdown integration with the estimated biases. Velocities and images alone: the rate and
     velocity are held. One thread may predict while another adds: states are only appended, and
@@ -77,6 +78,7 @@ class PosePredictor:
         self._bias: tuple[FloatArray, FloatArray] = (_ZERO, _ZERO)
         # accelerometer and gyro, equation (A1)
         self._matrices: tuple[FloatArray, FloatArray] | None = None
+        self._offset_ns = 0  # of the sensor's clock from the camera's, as estimated
         self._last: Estimate | None = None
         self._states: list[_State] = []  # at the newest estimate and at the samples after it
         self._past: list[_State] = []  # at the estimates and samples of the last seconds before it
@@ -87,7 +89,7 @@ class PosePredictor:
         while sample.time_ns - self._samples[0].time_ns > _PREDICTION.kept_ns:
             self._samples.popleft()
         states = self._states
-        if states and sample.time_ns > states[-1].time_ns:
+        if states and sample.time_ns - self._offset_ns > states[-1].time_ns:
             states.append(self._carried(states[-1], sample))
             if len(states) > _PREDICTION.max_states:
                 self._states = [states[0], *states[-_PREDICTION.max_states // 2 :]]
@@ -103,6 +105,8 @@ class PosePredictor:
             self._matrices = imu_matrices(estimate.imu_terms)
         if estimate.gravity_world is not None:
             self._gravity = estimate.gravity_world
+        if estimate.time_offset_s is not None:
+            self._offset_ns = round(NS_PER_S * estimate.time_offset_s)
         omega, v = self._motion_of(estimate)
         state = _State(
             estimate.time_ns,
@@ -114,7 +118,7 @@ class PosePredictor:
         )
         states = [self._with_sample(state)]
         for sample in self._samples:
-            if sample.time_ns > estimate.time_ns:
+            if sample.time_ns - self._offset_ns > estimate.time_ns:
                 states.append(self._carried(states[-1], sample))
         known = [*self._past, *self._states]
         first = bisect_left(known, estimate.time_ns - _PREDICTION.kept_ns, key=_time_ns)
@@ -148,9 +152,10 @@ class PosePredictor:
 
         Where the sensor is silent, or is not used any more, the motion stays that of the estimates.
         """
-        before = [sample for sample in self._samples if sample.time_ns <= state.time_ns]
+        until_ns = state.time_ns + self._offset_ns
+        before = [sample for sample in self._samples if sample.time_ns <= until_ns]
         longest_ns = round(_PREDICTION.max_step_s * NS_PER_S)
-        if not before or state.time_ns - before[-1].time_ns > longest_ns:
+        if not before or until_ns - before[-1].time_ns > longest_ns:
             return state
         return self._held(state, before[-1])
 
@@ -192,16 +197,17 @@ class PosePredictor:
 
     def _carried(self, state: _State, sample: MotionSample) -> _State:
         """The state at a later sample; with an IMU by the mean of its readings at both ends."""
-        dt = (sample.time_ns - state.time_ns) * S_PER_NS
+        time_ns = sample.time_ns - self._offset_ns
+        dt = (time_ns - state.time_ns) * S_PER_NS
         if isinstance(sample, VelocitySample):
             R, p, v = _moved(state, dt)
-            return self._held(_State(sample.time_ns, R, p, v, state.gyro, state.accel), sample)
+            return self._held(_State(time_ns, R, p, v, state.gyro, state.accel), sample)
         gyro, accel = self._unbiased(sample)
         R = state.R @ so3_exp(0.5 * (state.gyro + gyro) * dt)
         force = R @ accel + self._gravity
         a = 0.5 * (state.accel + force)
         return _State(
-            sample.time_ns,
+            time_ns,
             R,
             state.p + state.v * dt + 0.5 * a * dt**2,
             state.v + a * dt,
