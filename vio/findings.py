@@ -73,6 +73,32 @@ class Finding:
         }
 
 
+def begun(
+    code: str,
+    frame: int,
+    text: str,
+    since: int | None = None,
+    *,
+    figures: Mapping[str, float] | None = None,
+) -> Finding:
+    """Return that something has begun, and lasts until it has `ended`.
+
+    Args:
+        code: a key of `CODES`.
+        frame: that it was found at.
+        text: what was seen, its likely cause, what to do.
+        since: first frame that it holds for; None: `frame`.
+        figures: with units in their names.
+    """
+    message = f"frame {frame}: {text}"
+    return Finding(code, message, frame, since, lasts=True, figures=figures or {})
+
+
+def ended(code: str, frame: int, text: str) -> Finding:
+    """Return that what had `begun` no longer holds from a frame on."""
+    return Finding(code, f"frame {frame}: {text}", frame, ended=True)
+
+
 class Finder:
     """Base of what finds something: keeps findings until they are taken."""
 

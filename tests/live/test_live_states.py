@@ -19,12 +19,13 @@ import pytest
 from tests.filters.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from vio.config import Config
 from vio.errors import DataError, EstimationError, VioError
-from vio.geometry.lie import se3_from_parts, se3_log
+from vio.geometry.lie import se3_from_parts, se3_log, so3_log
+from vio.imu.findings import ImuVerdict
 from vio.live.inputs import _Stamps
 from vio.live.live_odometry import LiveOdometry
 from vio.live.prediction import PosePredictor
 from vio.live.worker import QuietCollector
-from vio.records import FrameResult
+from vio.records import Estimate, FrameResult, ImuSample
 
 CONFIG = replace(Config(), motion="none")
 NOISE = np.random.default_rng(3)
@@ -309,6 +310,62 @@ def test_a_prediction_that_lags_is_answered_from_what_was_known() -> None:
         assert np.linalg.norm(se3_log(np.linalg.inv(true) @ moved)) < 3e-3
         with pytest.raises(DataError, match="too long before the newest estimate"):
             live.predict(newest.time_ns - 2_500_000_000)
+
+
+def test_a_silent_imu_is_not_held_for_ever() -> None:
+    """A body brakes and turns until its IMU falls silent, and goes on straight at 1 m/s."""
+    live = PosePredictor(9.81)
+    for k in range(201):
+        braking = np.array([-4.0, 0.0, 9.81])
+        live.sample(ImuSample(k * 5_000_000, np.array([0.0, 0.0, 0.5]), braking))
+    T = np.eye(4)
+    for k in range(20, 60):
+        T = T.copy()
+        T[0, 3] = 0.05 * k
+        live.estimate(Estimate(k * 50_000_000, T, np.eye(6), velocity_world=np.array([1.0, 0, 0])))
+        moved = live.predict((50 * k + 300) * 1_000_000).T_world_imu
+        if k > 40:
+            assert moved[0, 3] == pytest.approx(0.05 * k + 0.3, abs=1e-9)
+            assert moved[1, 0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_predictions_take_the_offset_of_the_clocks_into_account() -> None:
+    """A body whose rate of turn changes; its IMU's clock is 40 ms ahead, as the filter has found."""
+    live = PosePredictor(9.81)
+    offset_ns = 40_000_000
+    for k in range(60):
+        t = 5e-3 * k
+        gyro = np.array([0.0, 0.0, 20.0 * t])
+        live.sample(ImuSample(k * 5_000_000 + offset_ns, gyro, np.array([0.0, 0.0, 9.81])))
+    here = Estimate(
+        100_000_000, np.eye(4), np.eye(6), velocity_world=np.zeros(3), time_offset_s=0.04
+    )
+    live.estimate(here)
+    turn = so3_log(live.predict(200_000_000).T_world_imu[:3, :3])[2]
+    assert turn == pytest.approx(10.0 * (0.2**2 - 0.1**2), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "rate"),
+    [(ImuVerdict(gyro_factor=np.radians(1.0)), 0.5), (ImuVerdict(usable=False), 0.0)],
+)
+def test_predictions_take_samples_as_the_filter_does(verdict: ImuVerdict, rate: float) -> None:
+    """Of a gyro in degrees a second, which the monitor has found, or that is not used any more."""
+    live = LiveOdometry(CAMERA, T_cam0_imu=T_CAM0_IMU, drop="none")
+    _OPEN.append(live)
+    for k in range(4):
+        for n in range(10):
+            t = (k - 1) * STEP_NS + n * STEP_NS // 10
+            live.add_imu(t, np.zeros(3), np.array([0.0, 0.0, 9.81]))
+        live.add_observations(k * STEP_NS, SEEN[0].ids, SEEN[0].z)
+    live._worker.ask(lambda: None)
+    live._odometry._processor.pipeline._imu = verdict
+    gyro = np.degrees([0.0, 0.0, 0.5])
+    for n in range(1, 41):
+        live.add_imu(3 * STEP_NS + n * STEP_NS // 10, gyro, np.array([0.0, 0.0, 9.81]))
+    before, after = (live.predict(k * STEP_NS).T_world_imu[:3, :3] for k in (3, 7))
+    turn = rate * 4e-9 * STEP_NS
+    assert so3_log(before.T @ after)[2] == pytest.approx(turn, abs=0.05 * turn + 1e-3)
 
 
 def test_past_poses_lie_between_their_neighbours() -> None:

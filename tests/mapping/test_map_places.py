@@ -4,13 +4,22 @@ covariance.
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+    transform_points,
+)
+from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project
 from vio.mapping import place_index
 from vio.mapping.features import (
@@ -21,7 +30,9 @@ from vio.mapping.features import (
     no_keyframe_features,
 )
 from vio.mapping.loop_geometry import MIN_INLIERS, match, verify
-from vio.mapping.map_store import MapStore, PlacesRow
+from vio.mapping.map_graph import MapGraph
+from vio.mapping.map_store import KeyframeRow, MapStore, PlacesRow, SessionRow
+from vio.mapping.place_finder import squared
 from vio.mapping.place_index import SEGMENT, PlaceIndex, Segment, words_of
 
 CAMERA = StereoCamera(400.0, 400.0, 319.5, 179.5, 0.12, 640, 360)
@@ -179,6 +190,51 @@ def test_a_darker_right_camera_leaves_the_disparities_exact() -> None:
         disparity = (features.z[:, 0] - features.z[:, 2])[features.has_right]
         errors.append(np.quantile(np.abs(disparity - 6.3), 0.9))
     assert max(errors) < 0.1
+
+
+@pytest.mark.parametrize("earlier", [True, False])
+def test_covariance_of_a_neighbour_covers_it(tmp_path: Path, earlier: bool) -> None:
+    """On a straight road; a turn at the one end moves the other end, and not the one beside it."""
+    sigmas = np.repeat([0.01, 0.002], 3)
+    step = se3_from_parts(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    squares = []
+    with closing(MapStore(tmp_path / "empty.db", create=True)) as store:
+        for seed in range(100):
+            graph = MapGraph(store)
+            graph.sessions = [SessionRow("road", CAMERA, False, 0)]
+            rng = np.random.default_rng(seed)
+            T_odom: FloatArray = np.eye(4)
+            motion = None
+            for k in range(11):
+                if k > 0:
+                    motion = RelativePose(
+                        step @ se3_exp(sigmas * rng.normal(size=6)), np.diag(sigmas**2)
+                    )
+                    T_odom = T_odom @ motion.T_i_j
+                drift, path_m = graph.gathered(T_odom, motion)
+                graph.append(KeyframeRow(0, k, k, T_odom, T_odom, drift, path_m, None, 0.0))
+            origin, other = (9, 1) if earlier else (1, 9)
+            found = graph.motions(origin, np.array([other]))[0]
+            true = se3_from_parts(np.eye(3), np.array([0.0, 0.0, 2.0 * (other - origin)]))
+            squares.append(squared(se3_log(se3_inverse(found.T_i_j) @ true), found.covariance))
+    assert 0.8 < np.mean(squares) / 6 < 1.2
+
+
+def test_features_of_one_corner_agree_from_near_and_from_afar() -> None:
+    """An image in half the size shows each corner on other levels, at half its pixel as counted
+    from the image's edge.
+    """
+    rng = np.random.default_rng(5)
+    small = rng.uniform(20, 230, (90, 150)).astype(np.float32)
+    near = cv2.resize(small, (900, 540), interpolation=cv2.INTER_CUBIC)
+    afar = cv2.resize(near, (450, 270), interpolation=cv2.INTER_AREA)
+    a, b = (extract(*[np.clip(image, 0, 255).astype(np.uint8)] * 2) for image in (near, afar))
+    i, j = match(a, b).T
+    apart = a.z[i, :2] - (2 * b.z[j, :2] + 0.5)
+    same = np.abs(apart).max(axis=1) < 6
+    assert same.sum() > 100
+    assert np.abs(np.median(apart[same], axis=0)).max() < 0.25
+    assert np.abs(apart[same].mean(axis=0)).max() < 0.25
 
 
 @pytest.mark.parametrize("size", [(64, 64), (180, 320)])

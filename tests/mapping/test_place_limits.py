@@ -338,8 +338,8 @@ def _keyframes_searched(places: int) -> int:
     own = MagicMock(_forgotten=set())
     own._index.__len__.return_value = 60
     own._graph.session = np.zeros(60)
-    own._graph.T_map_cam = np.tile(np.eye(4), (60, 1, 1))
-    own._graph.drift = lambda i, k, systematic: np.zeros((len(k), 6, 6))
+    still = RelativePose(np.eye(4), np.zeros((6, 6)))
+    own._graph.motions = lambda origin, rows: [still] * len(rows)
     own._expected_places.return_value = middle
     own._priors.return_value = {k: MagicMock() for k in middle}
     own._views = partial(PlaceFinder._views, own)

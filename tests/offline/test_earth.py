@@ -582,6 +582,23 @@ def test_a_drive_that_never_moves_is_refused_in_words() -> None:
         georeference(path, fixes, np.zeros(3))
 
 
+def test_what_positions_leave_open_to_rounding_is_refused() -> None:
+    """No variance is negative, as for a jump in a map whose x is up: -1e18 m^2."""
+    p = np.array([[0.0, 0.0, 0.0], [2.5, 1e6, 0.0], [5.0, 1e6, 0.0]])
+    times_ns = np.linspace(0, 1_000_000_000, 30).astype(np.int64)
+    enu = np.stack([np.interp(1e-9 * times_ns, [0.0, 0.5, 1.0], p[:, k]) for k in range(3)], 1)
+    enu += np.random.default_rng(90).normal(0.0, 0.5, enu.shape)
+    geodetic = LocalFrame(np.array([89.9, 179.9999, 50.0])).geodetic(enu)
+    geodetic[:, 2] = np.nan
+    fixes = checked_fixes(times_ns, geodetic, None, "fixes")
+    none = np.zeros(0, dtype=np.int64)
+    poses = se3_from_parts(np.tile(np.eye(3), (3, 1, 1)), p)
+    times_ns = 500_000_000 * np.arange(3)
+    path = GraphPath(times_ns, poses, none, none, np.array([1.0, 0.0, 0.0]), 0.05, none)
+    with pytest.raises(EstimationError, match="do not determine"):
+        georeference(path, fixes, np.zeros(3))
+
+
 def test_tables_state_what_is_known(tmp_path: Path) -> None:
     """Horizontal standard deviations without that of the height, and columns between blanks."""
     file = tmp_path / "gnss.csv"

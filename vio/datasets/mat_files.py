@@ -5,15 +5,16 @@ from __future__ import annotations
 import errno
 import math
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from vio.datasets.common import check_array_bytes
 from vio.errors import DataError
 from vio.files.inputs import check_regular
 
 SUFFIX = ".mat"
+Shapes: TypeAlias = Mapping[str, tuple[int, ...]]  # of variables, by name
 HELD_OBJECT = (
     "holds an object of MATLAB's, which nothing else reads; save its numbers: "
     "s = toStruct(stereoParams); save('stereo.mat', 's', '-v7')"
@@ -31,13 +32,13 @@ def holds_object(path: Path) -> bool:
 
 
 def read_variables(
-    path: Path, wanted: Callable[[str], bool], *, plain: bool = False
-) -> tuple[dict[str, tuple[int, ...]], Mapping[str, Any]]:
+    path: Path, wanted: Callable[[Shapes], Collection[str]], *, plain: bool = False
+) -> tuple[Shapes, Mapping[str, Any]]:
     """Return the shapes of all variables of a MATLAB file, and some of them.
 
     Args:
         path: the file.
-        wanted: whether a variable of a name is read.
+        wanted: names of those to read, if they are there, by the shapes of all.
         plain: structures become dictionaries, and arrays lose axes of length one.
 
     Raises:
@@ -64,7 +65,8 @@ def read_variables(
         if held and all(kind in _OBJECTS or name.startswith("__") for name, _, kind in held):
             raise DataError(f"{path}: {HELD_OBJECT}")
         shapes = {name: shape for name, shape, _ in held}
-        names = [name for name in shapes if wanted(name)]
+        chosen = wanted(shapes)
+        names = [name for name in shapes if name in chosen]
         check_array_bytes({name: 8 * math.prod(shapes[name]) for name in names}, path)
         found = loadmat(path, mat_dtype=True, variable_names=names, simplify_cells=plain)
     except NotImplementedError as error:

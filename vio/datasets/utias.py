@@ -76,7 +76,7 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
 
 def _read_mat(path: Path) -> Mapping[str, FloatArray]:
     known = (*KEYS, *OPTIONAL_KEYS)
-    shapes, raw = read_variables(path, known.__contains__)
+    shapes, raw = read_variables(path, lambda _: known)
     _check_names(shapes, path)
     wanted = [name for name in known if name in shapes]
     for key in wanted:

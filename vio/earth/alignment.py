@@ -63,6 +63,7 @@ class _AlignmentRules:
 _ALIGNMENT = _AlignmentRules()
 _DRIFT_RAD = float(np.radians(0.03))
 _SCALE_SIGMA = 0.01  # prior
+_UNKNOWN = "the GNSS positions do not determine where the trajectory is; drive farther, with a turn"
 
 
 # of N positions: pose before, share of the way to the next one, (N, 3) in east, north, up, their
@@ -169,14 +170,19 @@ def georeference(
     residuals[inside] = measured - problem.antenna(T)
     T_enu_map, gain = _rigid_fit(path.T_map_body, T)
     spread = normal.solve(np.concatenate([gain.T, np.zeros((1, 6))]))
+    covariance = gain @ spread[:-1]
+    positions = _position_covariances(normal, T)
+    # rounding is larger than what is determined
+    if not ((np.diag(covariance) > 0).all() and (np.linalg.eigvalsh(positions) > 0).all()):
+        raise EstimationError(_UNKNOWN)
     unit = np.zeros((6 * len(T) + 1, 1))
     unit[-1] = 1.0
     return Georeference(
         frame=frame,
         T_enu_map=T_enu_map,
-        covariance=gain @ spread[:-1],
+        covariance=covariance,
         T_enu_body=T,
-        position_covariance=_position_covariances(normal, T),
+        position_covariance=positions,
         scale=float(np.exp(log_scale)),
         scale_sigma=float(np.sqrt(normal.solve(unit)[-1, 0])),
         used=used,
@@ -483,17 +489,16 @@ class _Factors:
     """The factors of a sparse symmetric matrix whose last row is full: it is eliminated last."""
 
     def __init__(self, H: csc_matrix) -> None:
-        unknown = "the GNSS positions do not determine where the trajectory is; drive farther, with a turn"
         try:
             self._rest = factors(H[:-1, :-1])
         except RuntimeError as error:  # exactly singular
-            raise EstimationError(unknown) from error
+            raise EstimationError(_UNKNOWN) from error
         self._border = H[:-1, -1:].toarray()
         self._solved = self._rest(self._border)
         eliminated = self._border.T @ self._solved
         self._last = float(H[-1, -1] - eliminated[0, 0])
         if not self._last > 0:  # NaN, too
-            raise EstimationError(unknown)
+            raise EstimationError(_UNKNOWN)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return the solution (6K + 1, n) for a right-hand side."""

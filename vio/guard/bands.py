@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import begun
 from vio.frontend.patches import mean_and_contrast
 from vio.geometry.lie import FloatArray
 from vio.guard.image_check import FrameImages, ImageCheck
@@ -78,11 +78,11 @@ class BandRemoval(ImageCheck):
         self._last = centred
         if len(self._changed) >= _BANDS.frames:
             self._active = True
-            message = (
-                f"frame {index}: bands of brightness move through the images, differently in both "
+            text = (
+                "bands of brightness move through the images, differently in both "
                 "cameras (flickering light, or an unstable exposure); they are taken out row by row"
             )
-            self._found.append(Finding("bands", message, index, self._changed[0], lasts=True))
+            self._found.append(begun("bands", index, text, self._changed[0]))
 
 
 def _row_means(image: Image) -> FloatArray:

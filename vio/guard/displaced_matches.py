@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import begun, ended
 from vio.frontend.weighted_fit import ROW_SIGMA_PX, add_equations
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -79,18 +79,17 @@ class DisplacedMatches(MatchCheck):
         if not sign and state.since is None:
             self._learn(terms, rows, off_px)
         if state.to_report():
-            message = (
-                f"frame {index}: the right pixels contradict the left ones since frame "
+            text = (
+                "the right pixels contradict the left ones since frame "
                 f"{state.since}: their rows are off by {off_px:.1f} px more than before; the right "
                 "camera has turned in its mount, or the pairs have become others; going on with "
                 "the left pixels"
             )
-            self._found.append(
-                Finding(_CODE, message, index, state.since, lasts=True, figures={"rows_px": off_px})
-            )
+            self._found.append(begun(_CODE, index, text, state.since, figures={"rows_px": off_px}))
         if state.ends():
-            message = f"frame {index}: the right pixels agree with the left ones again"
-            self._found.append(Finding(_CODE, message, index, ended=True))
+            self._found.append(
+                ended(_CODE, index, "the right pixels agree with the left ones again")
+            )
         if state.since is not None:
             return without_right(seen)
         return self._without_wrong(seen, distance_px)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from vio.dataclass import dataclass
-from vio.findings import Finding
+from vio.findings import begun, ended
 from vio.guard.image_change import image_change
 from vio.guard.image_check import FrameImages, ImageCheck
 from vio.guard.probe import RowProbe
@@ -156,17 +156,18 @@ class ExchangeDetector(ImageCheck):
     def _report(self, index: int, order: Order) -> None:
         if order == "given":
             if self._since is not None:
-                message = f"frame {index}: left and right images are in order again"
-                self._found.append(Finding("images-exchanged", message, index, ended=True))
+                self._found.append(
+                    ended("images-exchanged", index, "left and right images are in order again")
+                )
             self._since = None
         elif self._since is None:
             self._since = index
             done = "they are put back" if order == "exchanged" else "the frames are skipped"
-            message = (
-                f"frame {index}: left and right images are exchanged from here on, as they match "
+            text = (
+                "left and right images are exchanged from here on, as they match "
                 f"with negative disparities only; {done}"
             )
-            self._found.append(Finding("images-exchanged", message, index, lasts=True))
+            self._found.append(begun("images-exchanged", index, text))
 
 
 def _look_exchanged(now: tuple[Image, Image], last: tuple[Image, Image]) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from vio.errors import DataError
-from vio.findings import Finder, Finding
+from vio.findings import Finder, begun, ended
 from vio.guard.match_check import Hysteresis
 from vio.guard.probe import MIN_SIGNED_PX
 from vio.records import Observations
@@ -60,15 +60,14 @@ class ExchangedMatches(Finder):
                 "features, or the cameras' calibration"
             )
         if self._in_order and state.to_report():
-            message = (
-                f"frame {index}: left and right pixels are exchanged from here on, as {negative} of "
+            text = (
+                f"left and right pixels are exchanged from here on, as {negative} of "
                 f"{matches} disparities are negative; they are put back"
             )
             figures = {"negative_share": negative / matches}
-            self._found.append(Finding(_CODE, message, index, lasts=True, figures=figures))
+            self._found.append(begun(_CODE, index, text, figures=figures))
         if state.ends():
-            message = f"frame {index}: left and right pixels are in order again"
-            self._found.append(Finding(_CODE, message, index, ended=True))
+            self._found.append(ended(_CODE, index, "left and right pixels are in order again"))
 
     def _put_back(self, seen: Observations) -> Observations:
         """Return the pixels in their order; features of one image alone would be of the wrong

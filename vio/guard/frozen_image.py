@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from vio.dataclass import dataclass
-from vio.findings import Finding
+from vio.findings import begun, ended
 from vio.frontend.patches import mean_and_contrast
 from vio.guard.image_change import image_change
 from vio.guard.image_check import FrameImages, ImageCheck
@@ -138,34 +138,33 @@ class FrozenCamera(ImageCheck):
         self._count += 1
         if self._count == _FROZEN.frames:
             self._reported = cause
-            message = (
-                f"frame {index}: {_SEEN[cause]}, since frame {self._since}; going on with the left "
-                "images"
-            )
-            self._found.append(Finding(cause, message, index, self._since + 1, lasts=True))
+            text = f"{_SEEN[cause]}, since frame {self._since}; going on with the left images"
+            self._found.append(begun(cause, index, text, self._since + 1))
 
     def _end_right(self, index: int) -> None:
         assert self._cause is not None
         if self._count >= _FROZEN.frames:
-            message = f"frame {index}: the right camera gives new images again"
-            self._found.append(Finding(self._reported, message, index, ended=True))
+            self._found.append(
+                ended(self._reported, index, "the right camera gives new images again")
+            )
         self._cause = None
 
     def _count_left(self, since: int, index: int) -> None:
         """Count frames with a frozen left image, and report it once."""
         self._left_frozen += 1
         if self._left_frozen == _FROZEN.frames:
-            message = (
-                f"frame {index}: the left camera is frozen: its image does not change since frame "
+            text = (
+                "the left camera is frozen: its image does not change since frame "
                 f"{since} while the right one does; the right images alone follow what the last "
                 "pair has seen"
             )
-            self._found.append(Finding("left-image-frozen", message, index, since + 1, lasts=True))
+            self._found.append(begun("left-image-frozen", index, text, since + 1))
 
     def _end_left(self, index: int) -> None:
         if self._left_frozen >= _FROZEN.frames:
-            message = f"frame {index}: the left camera gives new images again"
-            self._found.append(Finding("left-image-frozen", message, index, ended=True))
+            self._found.append(
+                ended("left-image-frozen", index, "the left camera gives new images again")
+            )
         self._left_frozen = 0
 
 

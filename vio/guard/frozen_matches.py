@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import begun, ended
 from vio.guard.match_check import Hysteresis, MatchCheck, SharedMatches, without_right
 from vio.records import Observations
 
@@ -38,14 +38,13 @@ class FrozenMatches(MatchCheck):
         state = self._state
         state.show(index, _is_frozen(shared))
         if state.to_report():
-            message = (
-                f"frame {index}: the right camera is frozen since frame {state.since}: its pixels "
+            text = (
+                f"the right camera is frozen since frame {state.since}: its pixels "
                 "stay while the left ones move; going on with the left ones"
             )
-            self._found.append(Finding(_CODE, message, index, state.since, lasts=True))
+            self._found.append(begun(_CODE, index, text, state.since))
         if state.ends():
-            message = f"frame {index}: the right pixels move again, and are used"
-            self._found.append(Finding(_CODE, message, index, ended=True))
+            self._found.append(ended(_CODE, index, "the right pixels move again, and are used"))
         return seen if state.since is None else without_right(seen)
 
 

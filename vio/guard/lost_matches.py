@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vio.findings import Finding
+from vio.findings import begun, ended
 from vio.guard.match_check import Hysteresis, MatchCheck, SharedMatches
 from vio.records import Observations
 
@@ -45,18 +45,15 @@ class LostMatches(MatchCheck):
             usual = share if self._usual is None else self._usual
             self._usual = usual + _LOST.gain * (share - usual)
         if share is not None and state.to_report():
-            message = (
-                f"frame {index}: hardly any feature has a right match since frame {state.since} "
+            text = (
+                f"hardly any feature has a right match since frame {state.since} "
                 f"({100 * share:.0f} % instead of {100 * (self._usual or 0.0):.0f} %); the right "
                 "camera may be dark, covered or turned; going on with the left pixels"
             )
             figures = {"share": share, "usual_share": self._usual or 0.0}
-            self._found.append(
-                Finding(_CODE, message, index, state.since, lasts=True, figures=figures)
-            )
+            self._found.append(begun(_CODE, index, text, state.since, figures=figures))
         if state.ends():
-            message = f"frame {index}: features have right matches again"
-            self._found.append(Finding(_CODE, message, index, ended=True))
+            self._found.append(ended(_CODE, index, "features have right matches again"))
         return seen
 
     def _is_lost(self, share: float | None) -> bool | None:

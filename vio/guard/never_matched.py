@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vio.findings import Finder, Finding
+from vio.findings import Finder, begun, ended
 from vio.records import Observations
 
 
@@ -48,8 +48,7 @@ class NeverMatched(Finder):
         if self._reported:
             if share >= _NEVER.back_share:
                 self._over = True
-                message = f"frame {index}: features have right matches"
-                self._found.append(Finding(_CODE, message, index, ended=True))
+                self._found.append(ended(_CODE, index, "features have right matches"))
             return
         if share > _NEVER.matched_share:
             self._over = True
@@ -59,10 +58,10 @@ class NeverMatched(Finder):
         if self._frames < _NEVER.frames:
             return
         self._reported = True
-        message = (
-            f"frame {index}: hardly any feature has a right match since the first frame "
+        text = (
+            "hardly any feature has a right match since the first frame "
             f"({100 * share:.0f} %), so lengths are unknown; the right images may be turned, "
             "the left ones again, or not belong to the left ones or the calibration (vio inspect)"
         )
         figures = {"share": share}
-        self._found.append(Finding(_CODE, message, index, self._since, lasts=True, figures=figures))
+        self._found.append(begun(_CODE, index, text, self._since, figures=figures))

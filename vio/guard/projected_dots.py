@@ -17,7 +17,7 @@ from typing import NamedTuple, TypeAlias
 import cv2
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import begun
 from vio.geometry.lie import FloatArray
 from vio.guard.image_check import FrameImages, ImageCheck
 from vio.numerics.compiled import compiled_sums
@@ -110,16 +110,14 @@ class ProjectedDots(ImageCheck):
         if len(signs) < _DOTS.signs:
             return
         self._active = True
-        message = (
-            f"frame {images.index}: small bright spots stay in the images while the scene moves: "
+        text = (
+            "small bright spots stay in the images while the scene moves: "
             "the dots of an infrared projector; they are taken out, which costs accuracy; switch "
             "the projector off, or use the images without it"
         )
         figures = {"correlation": bright}
         since = min(self._since, signs[0])
-        self._found.append(
-            Finding(_CODE, message, images.index, since, lasts=True, figures=figures)
-        )
+        self._found.append(begun(_CODE, images.index, text, since, figures=figures))
 
 
 def without_dots(image: Image) -> Image:

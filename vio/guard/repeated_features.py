@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.findings import Finder, Finding
+from vio.findings import Finder, begun, ended
 from vio.geometry.lie import FloatArray, lengths
 from vio.guard.match_check import Hysteresis, without_right
 from vio.numerics.robust import median
@@ -142,17 +142,14 @@ class RepeatedFeatures(Finder):
         state.show(index, share >= _REPEATS.named_share)
         if state.to_report():
             what = "pixels" if same >= carried else "disparities"
-            message = (
-                f"frame {index}: the {what} of {100 * share:.0f} % of the features are those of the "
+            text = (
+                f"the {what} of {100 * share:.0f} % of the features are those of the "
                 f"frame before to the last bit since frame {state.since}, though others move: they "
                 "were not measured anew, and are left out; give what was measured in a frame alone"
             )
-            self._found.append(
-                Finding(_CODE, message, index, state.since, lasts=True, figures={"share": share})
-            )
+            self._found.append(begun(_CODE, index, text, state.since, figures={"share": share}))
         if state.ends():
-            message = f"frame {index}: features are measured anew again"
-            self._found.append(Finding(_CODE, message, index, ended=True))
+            self._found.append(ended(_CODE, index, "features are measured anew again"))
 
 
 def _in_plane(before: FloatArray, now: FloatArray) -> bool:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import begun, ended
 from vio.frontend.right_turn import PairShake, jump_limit_px
 from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import FloatArray
@@ -122,20 +122,19 @@ class ShiftedMatches(MatchCheck):
     def _report(self, index: int) -> None:
         state = self._state
         if state.to_report():
-            message = (
-                f"frame {index}: the right pixels contradict the left ones since frame "
+            text = (
+                "the right pixels contradict the left ones since frame "
                 f"{self._jumped}: all disparities are off by {self._off_px:.2g} px; the right camera "
                 "has turned in its mount, or the pairs have become others; going on with the left "
                 "pixels"
             )
             figures = {"offset_px": self._off_px}
-            self._found.append(
-                Finding(_CODE, message, index, self._jumped, lasts=True, figures=figures)
-            )
+            self._found.append(begun(_CODE, index, text, self._jumped, figures=figures))
         if state.ends():
             self._off_px = 0.0
-            message = f"frame {index}: the right pixels agree with the left ones again"
-            self._found.append(Finding(_CODE, message, index, ended=True))
+            self._found.append(
+                ended(_CODE, index, "the right pixels agree with the left ones again")
+            )
 
 
 def common_change(camera: StereoCamera, shared: SharedMatches) -> tuple[float, float] | None:

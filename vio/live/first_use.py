@@ -39,8 +39,6 @@ class _MadeUpRun(NamedTuple):
     """The run that is made up to be compiled for."""
 
     frames: Capacity[int] = 30
-    step_ns: Capacity[int] = 50_000_000
-    samples_per_frame: Capacity[int] = 10  # of a motion sensor, a frame
     points: Capacity[int] = 150
     min_track_frames: Capacity[int] = 4  # frames that a feature is seen in
     max_track_frames: Capacity[int] = 40
@@ -116,32 +114,27 @@ def compile_part(part: Part, motion: RunMotion) -> None:
 
 def _run_frontend(config: Config) -> None:
     from vio.frontend import build_frontend
-    from vio.live.warm_up import SwayingCamera
+    from vio.live.warm_up import STEP_NS, SwayingCamera
 
     frontend = build_frontend("auto", _CAMERA, config.frontend)
     source = SwayingCamera(_CAMERA, np.eye(4), config.imu.gravity_mps2)
     for index in range(_RUN.frames):
-        time_ns = index * _RUN.step_ns
+        time_ns = index * STEP_NS
         left, right, _ = source.images(time_ns)
         frontend.process(StereoFrame(index, time_ns, left, right))
 
 
 def _run_filter(config: Config) -> None:
     from vio.live.odometry import Odometry
-    from vio.live.warm_up import SwayingCamera
+    from vio.live.warm_up import STEP_NS, SwayingCamera
 
     T_cam0_imu = np.eye(4) if config.motion == "imu" else None
     odometry = Odometry(_CAMERA, config, T_cam0_imu=T_cam0_imu)
     source = SwayingCamera(_CAMERA, odometry.T_cam0_body, config.imu.gravity_mps2)
     features = _Features()
     for index in range(_RUN.frames):
-        time_ns = index * _RUN.step_ns
-        for k in range(1 - _RUN.samples_per_frame, 1):
-            sample_ns = time_ns + k * _RUN.step_ns // _RUN.samples_per_frame
-            if odometry.motion == "imu":
-                odometry.add_imu(sample_ns, *source.imu(sample_ns))
-            elif odometry.motion == "velocity":
-                odometry.add_velocity(sample_ns, *source.velocity(sample_ns))
+        time_ns = index * STEP_NS
+        source.add_samples(odometry, time_ns)
         x_m, *_ = source.motion(time_ns * 1e-9)
         odometry.add_observations(time_ns, *features.seen(index, x_m))
     odometry.landmarks()

@@ -238,7 +238,8 @@ class LiveOdometry(EventInputs[None]):
         elif given is not None:
             self._worker.put(lambda: self._process(given))
             for sample in given:
-                self._predictor.add(sample)
+                if (usable := self._odometry.usable(sample)) is not None:
+                    self._predictor.add(usable)
 
     def reset(self) -> None:
         """Forget all: the next frame begins a new trajectory in a new world frame; see

@@ -185,10 +185,18 @@ class Odometry(EventInputs["Estimate | None"]):
                 results = self._add(self._frame(given))
                 return results[-1].estimate if results else None
             for sample in given:
-                if (usable := self._processor.pipeline.usable(sample)) is not None:
+                if (usable := self.usable(sample)) is not None:
                     self._predictor.sample(usable)
                 self._add(sample)
             return None
+
+    def usable(self, sample: MotionSample) -> MotionSample | None:
+        """Return a sample as the filter takes it: in the units and axes that were found to be the
+        right ones.
+
+        None: it does not, as the sensor was found to be wrong.
+        """
+        return self._processor.pipeline.usable(sample)
 
     def finish(self) -> list[FrameResult]:
         """Process the frames that still wait, and let the checks report what is left."""

@@ -13,7 +13,15 @@ import numpy as np
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.numerics.kinds import Capacity
-from vio.records import S_PER_NS, Estimate, ImuSample, MotionSample, VelocitySample, imu_matrices
+from vio.records import (
+    NS_PER_S,
+    S_PER_NS,
+    Estimate,
+    ImuSample,
+    MotionSample,
+    VelocitySample,
+    imu_matrices,
+)
 
 
 class _PredictionRules(NamedTuple):
@@ -56,7 +64,8 @@ def _time_ns(state: _State) -> int:
 
 
 class PosePredictor:
-    """Carries the newest estimate over the motion samples after it.
+    """Carries the newest estimate over the motion samples after it, on the camera's clock: samples
+    are moved by the offset of the clocks where the filter estimates it.
 
     IMU: strapdown integration with the estimated biases. Velocities and images alone: the rate and
     velocity are held. One thread may predict while another adds: states are only appended, and
@@ -69,6 +78,7 @@ class PosePredictor:
         self._bias: tuple[FloatArray, FloatArray] = (_ZERO, _ZERO)
         # accelerometer and gyro, equation (A1)
         self._matrices: tuple[FloatArray, FloatArray] | None = None
+        self._offset_ns = 0  # of the sensor's clock from the camera's, as estimated
         self._last: Estimate | None = None
         self._states: list[_State] = []  # at the newest estimate and at the samples after it
         self._past: list[_State] = []  # at the estimates and samples of the last seconds before it
@@ -79,7 +89,7 @@ class PosePredictor:
         while sample.time_ns - self._samples[0].time_ns > _PREDICTION.kept_ns:
             self._samples.popleft()
         states = self._states
-        if states and sample.time_ns > states[-1].time_ns:
+        if states and sample.time_ns - self._offset_ns > states[-1].time_ns:
             states.append(self._carried(states[-1], sample))
             if len(states) > _PREDICTION.max_states:
                 self._states = [states[0], *states[-_PREDICTION.max_states // 2 :]]
@@ -95,6 +105,8 @@ class PosePredictor:
             self._matrices = imu_matrices(estimate.imu_terms)
         if estimate.gravity_world is not None:
             self._gravity = estimate.gravity_world
+        if estimate.time_offset_s is not None:
+            self._offset_ns = round(NS_PER_S * estimate.time_offset_s)
         omega, v = self._motion_of(estimate)
         state = _State(
             estimate.time_ns,
@@ -104,10 +116,9 @@ class PosePredictor:
             omega,
             _ZERO,
         )
-        before = [sample for sample in self._samples if sample.time_ns <= estimate.time_ns]
-        states = [self._held(state, before[-1]) if before else state]
+        states = [self._with_sample(state)]
         for sample in self._samples:
-            if sample.time_ns > estimate.time_ns:
+            if sample.time_ns - self._offset_ns > estimate.time_ns:
                 states.append(self._carried(states[-1], sample))
         known = [*self._past, *self._states]
         first = bisect_left(known, estimate.time_ns - _PREDICTION.kept_ns, key=_time_ns)
@@ -135,6 +146,18 @@ class PosePredictor:
         state = next(state for state in reversed(states) if state.time_ns <= time_ns)
         R, p, v = _moved(state, min((time_ns - state.time_ns) * S_PER_NS, _PREDICTION.max_step_s))
         return PredictedPose(time_ns, se3_from_parts(R, p), v)
+
+    def _with_sample(self, state: _State) -> _State:
+        """The state of an estimate with the motion of the newest sample up to it.
+
+        Where the sensor is silent, or is not used any more, the motion stays that of the estimates.
+        """
+        until_ns = state.time_ns + self._offset_ns
+        before = [sample for sample in self._samples if sample.time_ns <= until_ns]
+        longest_ns = round(_PREDICTION.max_step_s * NS_PER_S)
+        if not before or until_ns - before[-1].time_ns > longest_ns:
+            return state
+        return self._held(state, before[-1])
 
     def _motion_of(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
         """Body rate (3,) rad/s and world velocity (3,) m/s at an estimate, from the last two
@@ -174,16 +197,17 @@ class PosePredictor:
 
     def _carried(self, state: _State, sample: MotionSample) -> _State:
         """The state at a later sample; with an IMU by the mean of its readings at both ends."""
-        dt = (sample.time_ns - state.time_ns) * S_PER_NS
+        time_ns = sample.time_ns - self._offset_ns
+        dt = (time_ns - state.time_ns) * S_PER_NS
         if isinstance(sample, VelocitySample):
             R, p, v = _moved(state, dt)
-            return self._held(_State(sample.time_ns, R, p, v, state.gyro, state.accel), sample)
+            return self._held(_State(time_ns, R, p, v, state.gyro, state.accel), sample)
         gyro, accel = self._unbiased(sample)
         R = state.R @ so3_exp(0.5 * (state.gyro + gyro) * dt)
         force = R @ accel + self._gravity
         a = 0.5 * (state.accel + force)
         return _State(
-            sample.time_ns,
+            time_ns,
             R,
             state.p + state.v * dt + 0.5 * a * dt**2,
             state.v + a * dt,

@@ -26,7 +26,6 @@ class _MadeUpRun(NamedTuple):
     """The images and samples that are made up."""
 
     frames: Capacity[int] = 40  # samples a frame
-    step_ns: Capacity[int] = 50_000_000
     samples_per_frame: Capacity[int] = 10
     far_px: Capacity[float] = 12.0  # disparities of the upper and the lower half of the images
     near_px: Capacity[float] = 24.0
@@ -36,6 +35,7 @@ class _MadeUpRun(NamedTuple):
 
 
 _RUN = _MadeUpRun()
+STEP_NS: Capacity[int] = 50_000_000  # from frame to frame
 
 
 def warm_up(
@@ -80,13 +80,8 @@ def sway(odometry: Odometry, config: Config) -> None:
     """Give an odometry the images and motion samples of two seconds."""
     source = SwayingCamera(odometry.camera, odometry.T_cam0_body, config.imu.gravity_mps2)
     for frame in range(_RUN.frames):
-        time_ns = frame * _RUN.step_ns
-        for k in range(1 - _RUN.samples_per_frame, 1):
-            sample_ns = time_ns + k * _RUN.step_ns // _RUN.samples_per_frame
-            if odometry.motion == "imu":
-                odometry.add_imu(sample_ns, *source.imu(sample_ns))
-            elif odometry.motion == "velocity":
-                odometry.add_velocity(sample_ns, *source.velocity(sample_ns))
+        time_ns = frame * STEP_NS
+        source.add_samples(odometry, time_ns)
         left, right, depth_m = source.images(time_ns)
         odometry.add_images(time_ns, left, right, depth_m=depth_m)
     odometry.finish()
@@ -126,6 +121,15 @@ class SwayingCamera:
         smooth = cv2.GaussianBlur(noise, (0, 0), _RUN.smooth_px)
         self._texture = np.clip(128.0 + 40.0 * smooth / smooth.std(), 0, 255).astype(np.uint8)
         self._rows = slice(0, rows), slice(rows, camera.height)
+
+    def add_samples(self, odometry: Odometry, time_ns: int) -> None:
+        """Give an odometry the motion samples of the time since the frame before."""
+        for k in range(1 - _RUN.samples_per_frame, 1):
+            sample_ns = time_ns + k * STEP_NS // _RUN.samples_per_frame
+            if odometry.motion == "imu":
+                odometry.add_imu(sample_ns, *self.imu(sample_ns))
+            elif odometry.motion == "velocity":
+                odometry.add_velocity(sample_ns, *self.velocity(sample_ns))
 
     def imu(self, time_ns: int) -> tuple[FloatArray, FloatArray]:
         """Return angular rate (3,) rad/s and specific force (3,) m/s^2."""

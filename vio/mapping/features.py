@@ -124,13 +124,24 @@ def extract(left: Image, right: Image, *, most: int = MAX_FEATURES) -> KeyframeF
     scale = np.array([_KEY_POINTS.scale**p.octave for p in points])
     order = np.lexsort((uv[:, 1], uv[:, 0]))  # OpenCV's own order is that of the levels
     uv = uv[order]
-    scale = scale[order]
     bits = bits[order]
-    ur, has_right = _right_pixels(orb, left, right, uv, scale, bits)
-    z = np.concatenate([uv, ur], axis=1).astype(np.float32)  # as a map file keeps it
-    return KeyframeFeatures(
-        z.astype(np.float64), has_right, scale.astype(np.float32).astype(np.float64), bits
-    )
+    sigma = scale[order].astype(np.float32).astype(np.float64)
+    centre = level_centre_px(sigma)
+    ur, has_right = _right_pixels(orb, left, right, uv + centre, scale[order], bits)
+    # as a map file keeps it
+    z = np.concatenate([uv, ur - centre], axis=1).astype(np.float32) + centre
+    return KeyframeFeatures(z, has_right, sigma, bits)
+
+
+def level_centre_px(scale: FloatArray) -> FloatArray:
+    """Return how far (N, 1) the centre of a pixel of a pyramid's level lies from where OpenCV
+    gives it, along u and v.
+
+    OpenCV multiplies the pixel's number by the level's scale (N,); its centre is at
+    `(number + 1/2) scale - 1/2`. Without it, features of one corner on two levels would differ by
+    up to 1.3 pixels.
+    """
+    return (scale[:, None] - 1.0) / 2.0
 
 
 def _spread(
@@ -153,7 +164,7 @@ def _spread(
 def _right_pixels(
     orb: cv2.ORB, left: Image, right: Image, uv: FloatArray, scale: FloatArray, bits: Bits
 ) -> tuple[FloatArray, BoolArray]:
-    """Match key points (N, 2) in the right image by descriptor near their row, and refine by
+    """Match key points at (N, 2) in the right image by descriptor near their row, and refine by
     Lucas-Kanade.
 
     Lucas-Kanade takes both images to be equally bright, which two cameras with their own exposure
@@ -164,8 +175,8 @@ def _right_pixels(
     there, there_bits = orb.detectAndCompute(right, None)
     if there_bits is None:
         return out, valid
-    at = np.array([p.pt for p in there])
     size = np.array([_KEY_POINTS.scale**p.octave for p in there])
+    at = np.array([p.pt for p in there]) + level_centre_px(size)
     i, j = _near_rows(uv[:, 1], at[:, 1], _EXTRACTION.rows_px * scale)
     shift = uv[i, 0] - at[j, 0]
     allowed = (shift > -1.0) & (shift < _KEY_POINTS.max_disparity_share * left.shape[1])

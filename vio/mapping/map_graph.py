@@ -216,6 +216,17 @@ class MapGraph:
             C = C + sigma[:, :, None] ** 2 * np.eye(6)
         return C
 
+    def motions(self, origin: int, rows: IntArray) -> list[RelativePose]:
+        """Return where keyframes (N,) are in the frame of another one by the map, with the
+        covariance of the odometry in between.
+        """
+        T = se3_inverse(self.T_map_cam[origin]) @ self.T_map_cam[rows]
+        C = self.drift(np.full(len(rows), origin), rows, systematic=0.0)
+        A = se3_adjoint(se3_inverse(T))
+        A[rows >= origin] = np.eye(6)  # `drift` is in the frame of the later one
+        C = A @ C @ np.swapaxes(A, 1, 2)
+        return [RelativePose(T[n], C[n]) for n in range(len(rows))]
+
     def join(self, moved: int, into: int, T_into_moved: FloatArray) -> None:
         """Take the keyframes of one part into the frame of another."""
         rows = self.part == moved

@@ -17,7 +17,7 @@ from vio.calibration.stereo_field import TERMS, DisplacementField
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
-from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures
+from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures, level_centre_px
 from vio.mapping.map_database import APPLICATION_ID, BEGIN, KEYS, SINCE, MapDatabase, damaged
 from vio.mapping.place_index import SEGMENT, Segment
 from vio.records import BoolArray, IntArray
@@ -155,7 +155,8 @@ class MapStore(MapDatabase):
             (number, row.session, row.frame, row.time_ns, *poses, row.path_m, up, row.up_sigma_rad),
         )
         bits = np.packbits(features.has_right).tobytes()
-        sizes = features.z.astype("<f4").tobytes(), bits, features.sigma_px.astype("<f4").tobytes()
+        z = features.z - level_centre_px(features.sigma_px)
+        sizes = z.astype("<f4").tobytes(), bits, features.sigma_px.astype("<f4").tobytes()
         self._insert("features", (number, *sizes, features.descriptors.tobytes()))
         return number
 
@@ -377,6 +378,7 @@ class MapStore(MapDatabase):
                 raise ValueError("its arrays are of different lengths")
             if not (np.isfinite(pixels[:, :2]).all() and np.isfinite(sigma_px).all()):
                 raise ValueError("a pixel is not finite")
+            pixels += level_centre_px(sigma_px)
             return KeyframeFeatures(pixels, right[: len(bits)], sigma_px, bits.copy())
 
         found = self._read("features", made, f"WHERE keyframe = {int(keyframe)}")

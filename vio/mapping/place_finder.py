@@ -346,11 +346,10 @@ class PlaceFinder:
             sorted((m for m in rows if session[m] == session[i]), key=lambda m: abs(m - i)),
             dtype=np.int64,
         )
-        covariance = graph.drift(np.full(len(near), origin), near, systematic=0.0)
-        motion = se3_inverse(graph.T_map_cam[origin]) @ graph.T_map_cam[near]
+        motions = graph.motions(origin, near)
         return [
-            PlaceView(m, self._shown(m), RelativePose(motion[n], covariance[n]), i)
-            for n, m in enumerate(near.tolist())
+            PlaceView(m, self._shown(m), motion, i)
+            for m, motion in zip(near.tolist(), motions, strict=True)
         ]
 
     def _read_shown(self, keyframe: int) -> Shown:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import Finding, begun, ended
 from vio.numerics.robust import median
 
 
@@ -79,8 +79,8 @@ class ImuContradiction:
             return []
         self._reported = True
         ratio = median(np.array([ratio for _, ratio in off]))
-        message = (
-            f"frame {index}: in {len(off)} of {len(self._ratios)} frames the features lie "
+        text = (
+            f"in {len(off)} of {len(self._ratios)} frames the features lie "
             f"{ratio:.1f} standard deviations from where the IMU predicts them; check its clock, "
             "axes, units, range and mount (vio check)"
         )
@@ -89,7 +89,7 @@ class ImuContradiction:
             since = min(off[0][0], self._sum_since)
         else:
             since = off[0][0]
-        return [Finding(_CODE, message, index, since, lasts=True, figures=figures)]
+        return [begun(_CODE, index, text, since, figures=figures)]
 
     def _add(self, index: int, ratio: float) -> None:
         """Add what a frame is off by to the sum."""
@@ -105,5 +105,4 @@ class ImuContradiction:
         if not self._reported:
             return []
         self._reported = False
-        message = f"frame {index}: the images agree with the predicted motion again"
-        return [Finding(_CODE, message, index, ended=True)]
+        return [ended(_CODE, index, "the images agree with the predicted motion again")]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from vio.findings import Finding
+from vio.findings import Finding, begun, ended
 from vio.records import UpdateReport
 
 
@@ -53,13 +53,12 @@ class FewFeatures:
         self._few = few
         self._count = 0
         if not few:
-            message = f"frame {index}: enough features again"
-            return [Finding(_CODE, message, index, ended=True)]
-        message = (
-            f"frame {index}: fewer than {_FEW.least} features carry the motion since frame "
+            return [ended(_CODE, index, "enough features again")]
+        text = (
+            f"fewer than {_FEW.least} features carry the motion since frame "
             f"{self._since}, too few to tell the scene from what moves on its own: more light or "
             "texture, a wider lens, or a motion sensor would"
         )
         # the motion may be another's altogether
         figures = {"used": float(report.used), "doubted_share": 1.0}
-        return [Finding(_CODE, message, index, self._since, lasts=True, figures=figures)]
+        return [begun(_CODE, index, text, self._since, figures=figures)]

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import Finding, begun, ended
 from vio.geometry.lie import FloatArray, length, lengths
 from vio.numerics.robust import median
 
@@ -94,12 +94,12 @@ class FrameOrder:
         since = self._indices[int(goes_back.argmax())]
         self._least_m = _ORDER.back * median(lengths(steps))
         self._reported = True
-        message = (
-            f"frame {index}: the images go back and forth, and show a smooth motion in another order: "
+        text = (
+            "the images go back and forth, and show a smooth motion in another order: "
             f"since frame {since} at the latest, they are not in the order of their exposures; order "
             "them by their stamps or numbers"
         )
-        return [Finding(_CODE, message, index, since, lasts=True)]
+        return [begun(_CODE, index, text, since)]
 
     def _look(self, index: int) -> None:
         """Look whether the newest positions are those of a smooth path in another order."""
@@ -114,10 +114,10 @@ class FrameOrder:
         self._reported = False
         self._least_m = 0.0
         self._found.clear()
-        message = f"frame {index}: no step goes back any more: the images are in order again"
+        text = "no step goes back any more: the images are in order again"
         if self._since_back < _ORDER.clear_frames:
-            message = f"frame {index}: the path is smooth in no other order any more"
-        return [Finding(_CODE, message, index, ended=True)]
+            text = "the path is smooth in no other order any more"
+        return [ended(_CODE, index, text)]
 
 
 def _is_smooth_in_order(p: FloatArray, before: FloatArray) -> bool:

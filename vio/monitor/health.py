@@ -12,7 +12,7 @@ import numpy as np
 
 from vio.calibration.severity import rows_grade
 from vio.dataclass import dataclass
-from vio.findings import Finding
+from vio.findings import Finding, begun, ended
 from vio.geometry.lie import FloatArray, length
 from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile, squared_distance
@@ -212,17 +212,17 @@ class RunHealth:
         if said in self._reported:
             return []
         self._reported |= {"stereo", said}
-        seen = f"frame {index}: the rows of left and right images differ"
+        seen = "the rows of left and right images differ"
         figures = {"rows_rms_px": field.rows_rms_px}
         if other_pair:
-            message = (
+            text = (
                 f"{seen} by {field.rows_rms_px:.2f} px (rms): left and right are exchanged, the "
                 "calibration is not that of these images (as of rectified ones, where they are "
                 "raw), or a camera was moved; `vio calibrate` "
                 "finds which; what the calibration is off by is estimated while running, which may "
                 "not suffice (msckf.calibrate_stereo)"
             )
-            return [Finding("other-calibration", message, index, lasts=True, figures=figures)]
+            return [begun("other-calibration", index, text, figures=figures)]
         # What is corrected needs no figure here: the run ends with one.
         grade = rows_grade(field.rows_rms_px)
         if grade == "worth calibrating":
@@ -231,8 +231,8 @@ class RunHealth:
             size = f" by {field.rows_rms_px:.2f} px (rms)"
         verdict = "" if grade == "worth calibrating" else f", {grade}"
         message = (
-            f"{seen}{size} in a smooth pattern: the stereo calibration is off{verdict}; by how "
-            "much is estimated while running, and stated at the end (msckf.calibrate_stereo)"
+            f"frame {index}: {seen}{size} in a smooth pattern: the stereo calibration is off{verdict}; "
+            "by how much is estimated while running, and stated at the end (msckf.calibrate_stereo)"
         )
         return [Finding("stereo-calibration-off", message, index, figures=figures)]
 
@@ -256,8 +256,8 @@ class RunHealth:
             order = ""
             if name == "baseline" and percent < _RIG.backwards_percent:
                 order = "the order of the images (against a sensor they run backwards), "
-            message = (
-                f"frame {index}: the {named} is {abs(percent):.1f} % "
+            text = (
+                f"the {named} is {abs(percent):.1f} % "
                 f"{'longer' if percent > 0 else 'shorter'} than "
                 f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor "
                 f"measures; check {order}the sensor (unit, axes, clock) and that images and "
@@ -265,7 +265,7 @@ class RunHealth:
                 "the cameras anew, or run with what --save-calibration keeps"
             )
             figures = {"off_percent": percent, "sigma_percent": sigma}
-            lines.append(Finding("scale-off", message, index, lasts=True, figures=figures))
+            lines.append(begun("scale-off", index, text, figures=figures))
         return lines
 
     def _features(self, index: int, report: UpdateReport, estimate: Estimate) -> list[Finding]:
@@ -273,28 +273,27 @@ class RunHealth:
         time_ns = estimate.time_ns
         starts = report.initialised > 0 and not self._without_features
         if report.used > 0 or starts or self._last_used is None:
-            ended = self._without_features
+            was_without = self._without_features
             if self._last_used is None:
                 away_s = 0.0
             else:
                 away_s = (time_ns - self._last_used[1]) * 1e-9
             self._last_used = (index, time_ns)
             self._without_features = False
-            if not ended:
+            if not was_without:
                 return []
-            message = f"frame {index}: features again, after {away_s:.1f} s without"
-            return [Finding("no-features", message, index, ended=True)]
+            return [ended("no-features", index, f"features again, after {away_s:.1f} s without")]
         seconds = (time_ns - self._last_used[1]) * 1e-9
         if self._without_features or seconds < _GAPS.unseen_s:
             return []
         self._without_features = True
         sigma = _position_sigma(estimate)
-        message = (
-            f"frame {index}: no usable feature since frame {self._last_used[0]} ({seconds:.1f} s); "
+        text = (
+            f"no usable feature since frame {self._last_used[0]} ({seconds:.1f} s); "
             f"the pose is a prediction, the standard deviation of its position is {sigma:.2f} m"
         )
         since = self._last_used[0] + 1
-        return [Finding("no-features", message, index, since, lasts=True)]
+        return [begun("no-features", index, text, since)]
 
     def _implausible(self, index: int, estimate: Estimate) -> list[Finding]:
         """Report once when the state is implausible for a vehicle."""
@@ -304,7 +303,7 @@ class RunHealth:
         if self._last is not None and estimate.time_ns > self._last[0]:
             elapsed_s = (estimate.time_ns - self._last[0]) * 1e-9
             speed = length(position - self._last[1]) / elapsed_s
-            line = f"frame {index}: the estimate moves at {speed:.0f} m/s: the filter has diverged"
+            line = f"the estimate moves at {speed:.0f} m/s: the filter has diverged"
             lines += self._once(index, "speed", speed, _POSSIBLE.max_speed_mps, line)
         self._last = estimate.time_ns, position
         for name, bias, limit, unit in (
@@ -313,7 +312,7 @@ class RunHealth:
         ):
             if bias is not None:
                 size = length(bias)
-                line = f"frame {index}: the {name} is estimated as {size:.2g} {unit}, which no working sensor has"
+                line = f"the {name} is estimated as {size:.2g} {unit}, which no working sensor has"
                 lines += self._once(index, name, size, limit, line)
         return lines
 
@@ -336,12 +335,12 @@ class RunHealth:
         if off <= _POSSIBLE.max_offset_error_s + _POSSIBLE.offset_sigmas * sigma:
             return []
         self._reported.add("clock")
-        message = (
-            f"frame {index}: the estimate has frames exposed {1e3 * known:+.1f} ms after their stamps "
+        text = (
+            f"the estimate has frames exposed {1e3 * known:+.1f} ms after their stamps "
             f"on the IMU's clock, the rates of gyro and images show {1e3 * offset_s:+.0f} ms: a clock "
             "has jumped"
         )
-        return [Finding("estimate-implausible", message, index, since, lasts=True)]
+        return [begun("estimate-implausible", index, text, since)]
 
     def _settled(self, index: int, report: UpdateReport, estimate: Estimate) -> list[Finding]:
         """Report that the state has been possible for long, as of a filter that has found its start
@@ -357,19 +356,16 @@ class RunHealth:
         if waits or "clock" in self._reported or not self._reported.intersection(_STATE):
             return []
         self._reported -= {*_STATE}
-        message = (
-            f"frame {index}: the estimate is one that a working rig can have again, and the images "
-            "agree with it"
-        )
-        return [Finding("estimate-implausible", message, index, ended=True)]
+        text = "the estimate is one that a working rig can have again, and the images agree with it"
+        return [ended("estimate-implausible", index, text)]
 
     def _once(self, index: int, what: str, value: float, limit: float, line: str) -> list[Finding]:
         self._impossible |= value > limit
         if value <= limit or what in self._reported:
             return []
         self._reported.add(what)
-        message = f"{line}; check the order of the images, calibration, units and clocks"
-        return [Finding("estimate-implausible", message, index, lasts=True)]
+        text = f"{line}; check the order of the images, calibration, units and clocks"
+        return [begun("estimate-implausible", index, text)]
 
 
 def _position_sigma(estimate: Estimate) -> float:

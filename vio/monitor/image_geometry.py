@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.dataclass import dataclass
-from vio.findings import Finding
+from vio.findings import Finding, begun, ended
 from vio.geometry.lie import FloatArray, circledot, length, se3_exp, transform_points
 from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
 from vio.numerics.kinds import Tolerance
@@ -127,8 +127,9 @@ class ImageGeometry:
             return []
         self._changed = changed
         if not changed:
-            message = f"frame {seen.frame_index}: scale and crop of the images are as before again"
-            return [Finding(_CODE, message, seen.frame_index, ended=True)]
+            return [
+                ended(_CODE, seen.frame_index, "scale and crop of the images are as before again")
+            ]
         return [_changed(seen.frame_index, self._since_first)]
 
 
@@ -193,8 +194,8 @@ def _fitted(camera: StereoCamera, p: FloatArray, z: FloatArray) -> _Change | Non
 
 def _changed(index: int, since_first: FloatArray) -> Finding:
     columns, rows, right_px, down_px = since_first.tolist()
-    message = (
-        f"frame {index}: columns and rows of the images are scaled by {columns:.3f} and {rows:.3f}, "
+    text = (
+        f"columns and rows of the images are scaled by {columns:.3f} and {rows:.3f}, "
         f"and shifted by {right_px:.1f} and {down_px:.1f} px, from here on: another size, crop or "
         "zoom, for which the calibration is not"
     )
@@ -204,4 +205,4 @@ def _changed(index: int, since_first: FloatArray) -> Finding:
         "right_px": right_px,
         "down_px": down_px,
     }
-    return Finding(_CODE, message, index, lasts=True, figures=figures)
+    return begun(_CODE, index, text, figures=figures)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import Finding, begun, ended
 from vio.imu.faults import ImuFault, ImuFaultKind, ImuSampleCheck
 from vio.monitor.samples import GAP_S, GAP_STEPS
 from vio.records import S_PER_NS, ImuSample
@@ -112,19 +112,16 @@ class ImuFaultReport:
         is_zero = fault.size == 0.0
         if fault.end_ns is None:
             what = "reads zero in all axes" if is_zero else "repeats one reading to the last bit"
-            message = (
-                f"frame {self._frame}: the {sensor} {what} since {fault.start_ns} ns: the sensor "
+            text = (
+                f"the {sensor} {what} since {fault.start_ns} ns: the sensor "
                 "or its driver is stuck; its samples are left out, carried by images"
             )
             since = self._frames.first_after(fault.start_ns)
-            return Finding(code, message, self._frame, since, lasts=True)
+            return begun(code, self._frame, text, since)
         seconds = (fault.end_ns - fault.start_ns) * S_PER_NS
         what = "of zeros" if is_zero else "of one reading"
-        message = (
-            f"frame {self._frame}: the {sensor} gives new readings again, after {seconds:.2f} s "
-            f"{what}"
-        )
-        return Finding(code, message, self._frame, ended=True)
+        text = f"the {sensor} gives new readings again, after {seconds:.2f} s {what}"
+        return ended(code, self._frame, text)
 
     def _line(self, fault: ImuFault) -> list[str]:
         self._counts[fault.kind] = self._counts.get(fault.kind, 0) + 1
@@ -204,11 +201,11 @@ class ImuSilence:
         if self._lasts or waited_s <= GAP_S:
             return ()
         self._lasts = True
-        message = (
-            f"frame {index}: no IMU sample yet, {waited_s:.2f} s after frame {first}; carried by "
-            "images alone, in a world that is not upright"
+        text = (
+            f"no IMU sample yet, {waited_s:.2f} s after frame {first}; carried by images alone, in a "
+            "world that is not upright"
         )
-        return (Finding(_GAP, message, index, first, lasts=True),)
+        return (begun(_GAP, index, text, first),)
 
     def _began_late(self, index: int, imu_ns: int) -> tuple[Finding, ...]:
         """Return how late the first sample came, if it did."""
@@ -233,10 +230,8 @@ class ImuSilence:
             return ()
         self._lasts = True
         last_ns = self._times[-1]
-        message = (
-            f"frame {index}: no IMU sample since {last_ns} ns, for {gap_s:.2f} s; carried by images"
-        )
-        return (Finding(_GAP, message, index, self._frames.first_after(last_ns), lasts=True),)
+        text = f"no IMU sample since {last_ns} ns, for {gap_s:.2f} s; carried by images"
+        return (begun(_GAP, index, text, self._frames.first_after(last_ns)),)
 
     def _ended(self, until_ns: int, index: int) -> tuple[Finding, ...]:
         """Return that a sample comes after a gap."""

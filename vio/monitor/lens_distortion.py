@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.cameras.rectification_error import vertical_disparity_terms
-from vio.findings import Finding
+from vio.findings import Finding, begun
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.kinds import Tolerance
@@ -97,14 +97,14 @@ class LensCheck:
         self._frames = _LENS.looked_at[-1]
         self._matches.clear()
         index = seen.frame_index
-        message = (
-            f"frame {index}: rows of near and far points differ as lens distortion makes them, by "
+        text = (
+            "rows of near and far points differ as lens distortion makes them, by "
             f"{100 * abs(share):.0f} % of a pixel's way from the middle: raw images were given with a "
             "rectified calibration, rectified ones with a raw one, or the lenses are others; give the "
             "calibration of these images"
         )
         figures = {"distorted_share": share, "distorted_share_sigma": sigma}
-        return Finding(_CODE, message, index, 0, lasts=True, figures=figures)
+        return begun(_CODE, index, text, 0, figures=figures)
 
     def _share(self) -> tuple[float, float] | None:
         """By which share of its distance from the principal point a pixel is off where that squared

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import Finding, begun, ended
 from vio.numerics.robust import median
 from vio.records import Observations
 
@@ -79,8 +79,7 @@ class TrackMisfit:
             return [_begun(seen.frame_index, self._indices[0], excess)]
         if self._disagree and self._clear >= _MISFIT.clear_frames:
             self._disagree = False
-            message = f"frame {seen.frame_index}: tracks fit a common motion again"
-            return [Finding(_CODE, message, seen.frame_index, ended=True)]
+            return [ended(_CODE, seen.frame_index, "tracks fit a common motion again")]
         return []
 
     def _excess(self, seen: Observations, misfit: float) -> float | None:
@@ -112,21 +111,21 @@ class TrackMisfit:
 
 
 def _begun(index: int, since: int, excess: float) -> Finding:
-    message = (
-        f"frame {index}: tracks fit a common motion worse than before, and than their patches "
+    text = (
+        "tracks fit a common motion worse than before, and than their patches "
         f"explain ({excess:.1f} times the variance): something moves with the rig or by itself, "
         "slowly or in much of the image, and the motion may be a compromise with it"
     )
     figures = {"excess": excess, "doubted_share": 1.0 - 1.0 / excess}
-    return Finding(_CODE, message, index, since, lasts=True, figures=figures)
+    return begun(_CODE, index, text, since, figures=figures)
 
 
 def _apart(index: int, apart: Apart) -> Finding:
     how = "stay at the same pixels" if apart.still else "follow another motion"
-    message = (
-        f"frame {index}: {100 * apart.share:.0f} % of the tracks {how} while the others move: a part "
+    text = (
+        f"{100 * apart.share:.0f} % of the tracks {how} while the others move: a part "
         "of the rig, a mirror or a reflection is in view, or an object moves slowly, and the motion "
         "may be a compromise with it"
     )
     figures = {"second_share": apart.share, "doubted_share": apart.share}
-    return Finding(_CODE, message, index, apart.since, lasts=True, figures=figures)
+    return begun(_CODE, index, text, apart.since, figures=figures)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.dataclass import dataclass
-from vio.findings import Finding
+from vio.findings import Finding, begun, ended
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled, compiled_sums
 from vio.numerics.kinds import Capacity
@@ -129,14 +129,13 @@ class MixedExposures:
             if self._clear < _MIXED.clear_frames:
                 return []
             self._reported = False
-            message = f"frame {index}: images do not show the frame before any more"
-            return [Finding(_CODE, message, index, ended=True)]
+            return [ended(_CODE, index, "images do not show the frame before any more")]
         if len(mixed) < _MIXED.mixed:
             return []
         self._reported = True
         share = min(max(frame.share for frame in mixed), 1.0)
-        message = (
-            f"frame {index}: images show the frame before as well, with {100 * share:.0f} % of its "
+        text = (
+            f"images show the frame before as well, with {100 * share:.0f} % of its "
             "contrast, and features follow a motion between the two; switch off temporal noise "
             "reduction, blending of frames and temporal anti-aliasing"
         )
@@ -144,7 +143,7 @@ class MixedExposures:
         doubted = min(share / max(1.0 - share, share), 1.0)
         figures = {"share": share, "doubted_share": doubted}
         # the motion into the first such frame is in doubt already
-        return [Finding(_CODE, message, index, mixed[0].since, lasts=True, figures=figures)]
+        return [begun(_CODE, index, text, mixed[0].since, figures=figures)]
 
 
 def _share_of_before(seen: list[Observations], images: list[Image]) -> tuple[float, float] | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import Finding, begun
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -83,4 +83,4 @@ class ReadingCheck:
             return None
         figures = {"rows_rms_px": found.rms_px, "other_rms_px": found.other_px}
         index = seen.frame_index
-        return Finding(_CODE, f"frame {index}: {found}", index, 0, lasts=True, figures=figures)
+        return begun(_CODE, index, str(found), 0, figures=figures)

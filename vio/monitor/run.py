@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vio.errors import NOTE
-from vio.findings import Finding
+from vio.findings import Finding, ended
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.guard.repairing import AS_READ
@@ -299,9 +299,9 @@ class RunMonitor:
         before = self._lasting
         self._lasting = set()
         estimates = self._judged_again(frames, verdict)
-        message = f"frame {index}: that does not hold of the estimates that replace those before"
+        text = "that does not hold of the estimates that replace those before"
         for code in sorted(before - self._lasting):
-            self._add([Finding(code, message, index, ended=True)])
+            self._add([ended(code, index, text)])
         return estimates
 
     def _judged_again(

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vio.findings import Finding
+from vio.findings import Finding, begun, ended
 from vio.geometry.lie import FloatArray
 from vio.numerics.kinds import Capacity
 from vio.records import BoolArray, Image
@@ -87,13 +87,13 @@ class StillFeatures:
             return []
         self._reported = True
         self._calm = 0
-        message = (
-            f"frame {index}: all features stay at the same pixels since frame {self._since}, while "
+        text = (
+            f"all features stay at the same pixels since frame {self._since}, while "
             f"{100 * share:.0f} % of the view changes: a reflection or a pattern on a window is taken "
             "for the scene, or something moves nearly everywhere before a rig that stands still"
         )
         figures = {"changed_share": share}
-        return [Finding(_CODE, message, index, self._since, lasts=True, figures=figures)]
+        return [begun(_CODE, index, text, self._since, figures=figures)]
 
     def _stays(self, index: int) -> list[Finding]:
         if self._calm < _STILL.calm_checks:
@@ -102,8 +102,7 @@ class StillFeatures:
         self._since = None
         self._count = 0
         self._changed = 0
-        message = f"frame {index}: the view stays as the features do"
-        return [Finding(_CODE, message, index, ended=True)]
+        return [ended(_CODE, index, "the view stays as the features do")]
 
     def _moves(self, index: int) -> list[Finding]:
         self._since = None
@@ -113,8 +112,7 @@ class StillFeatures:
         if not self._reported or self._moved < _STILL.moved_frames:
             return []
         self._reported = False
-        message = f"frame {index}: features move again"
-        return [Finding(_CODE, message, index, ended=True)]
+        return [ended(_CODE, index, "features move again")]
 
 
 def _changed_share(before: Image, image: Image) -> float:

@@ -11,14 +11,14 @@ Calibration Toolbox for Matlab.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vio.cameras.rig import Rig
-from vio.datasets.mat_files import SUFFIX, read_variables
+from vio.datasets.mat_files import SUFFIX, Shapes, read_variables
 from vio.datasets.rigs.opencv import rig_from_opencv
 from vio.datasets.rigs.source import Source
 from vio.datasets.yaml_files import Entries, matrix, section
@@ -49,14 +49,18 @@ def read_mat(path: Path) -> dict[str, object]:
     """
     if path.stat().st_size > _MAX_BYTES:
         return {}
-    shapes, _ = read_variables(path, lambda _: False)
-    of_bouguet = "fc_left" in shapes and "fc_right" in shapes
-    # structures, whatever they hold, and no arrays of a recording
-    small = [name for name, shape in shapes.items() if math.prod(shape) <= _LARGEST]
-    wanted = _OF_BOUGUET if of_bouguet else small
-    _, found = read_variables(path, wanted.__contains__, plain=True)
+    _, found = read_variables(path, _of_calibration, plain=True)
     entries = {name: _plain(value) for name, value in found.items()}
     return {name: value for name, value in entries.items() if value is not None}
+
+
+def _of_calibration(shapes: Shapes) -> Collection[str]:
+    """Return the variables that may be those of a calibration: of MATLAB's, structures, whatever
+    they hold, and no arrays of a recording.
+    """
+    if "fc_left" in shapes and "fc_right" in shapes:
+        return _OF_BOUGUET
+    return [name for name, shape in shapes.items() if math.prod(shape) <= _LARGEST]
 
 
 def _plain(value: object) -> object:
