@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from hashlib import blake2b
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, lengths, se3_log
+from vio.guard.image_change import exposure_digest
 from vio.imu.standstill import STANDSTILL_S, blocks_agree
 from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Capacity
@@ -390,16 +390,12 @@ def _equal(a: Image, b: Image) -> bool:
 
 
 def _digest(frame: StereoFrame) -> bytes:
-    """What tells some rows of a frame's images from those of all other exposures; empty where these
-    rows have one gray value each.
+    """What tells some rows of a frame's images from those of other exposures and sizes; empty where
+    these rows have one gray value each.
     """
-    rows = [image[:: _FLOW.ring_stride_px] for image in _images(frame)]
-    if not any((image != image[:, :1]).any() for image in rows):
-        return b""
-    digest = blake2b(str([image.shape for image in _images(frame)]).encode(), digest_size=16)
-    for image in rows:
-        digest.update(image.tobytes())
-    return digest.digest()
+    images = _images(frame)
+    digest = exposure_digest([image[:: _FLOW.ring_stride_px] for image in images])
+    return digest and str([image.shape for image in images]).encode() + digest
 
 
 def _motion(before: Observations, now: Observations | TrackPrior) -> _Motion:
