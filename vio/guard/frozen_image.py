@@ -16,7 +16,8 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.frontend.patches import mean_and_contrast
-from vio.guard.image_change import exposure_digest, image_change
+from vio.guard.exposure import exposure_digest
+from vio.guard.image_change import image_change
 from vio.guard.image_check import FrameImages, ImageCheck
 from vio.numerics.kinds import Capacity
 from vio.records import Image

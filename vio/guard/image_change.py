@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from hashlib import blake2b
-
 import numpy as np
 
 from vio.frontend.patches import statistics
@@ -78,15 +75,3 @@ def _difference(image: Image, other: Image) -> float:
             unlike += image[y, x] != other[y, x]
             total += abs((image[y, x] - mean) / scale - (other[y, x] - other_mean) / other_scale)
     return total / (height * width) if unlike else 0.0
-
-
-def exposure_digest(images: Sequence[Image]) -> bytes:
-    """Return what tells images (H, W) from those of any other exposure, whose noise differs; empty
-    where each has one gray value, as exposures of darkness have.
-    """
-    if not any((image != image[:1, :1]).any() for image in images):
-        return b""
-    digest = blake2b(digest_size=16)
-    for image in images:
-        digest.update(image.tobytes())
-    return digest.digest()

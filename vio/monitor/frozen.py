@@ -24,7 +24,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, lengths, se3_log
-from vio.guard.image_change import exposure_digest
+from vio.guard.exposure import exposure_digest
 from vio.imu.standstill import STANDSTILL_S, blocks_agree
 from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Capacity
