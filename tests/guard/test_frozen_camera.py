@@ -70,3 +70,36 @@ def test_what_covers_the_right_image_does_not_freeze_the_left_one(
         if check.left_is_frozen(k, _image(step_px * k, rng), right):
             frozen.append(k)
     assert not frozen
+
+
+@pytest.mark.parametrize("ago", [2, 5])
+@pytest.mark.parametrize("camera", [0, 1])
+def test_an_image_of_some_frames_ago_is_not_used(ago: int, camera: int) -> None:
+    """Of one camera: its ring of buffers was read at the wrong place."""
+    rng = np.random.default_rng(2)
+    moving = [[_image(STEP_PX * k + at_px, rng) for k in range(20)] for at_px in (0, 10)]
+    shown = [list(images) for images in moving]
+    for k in (8, 12):
+        shown[camera][k] = moving[camera][k - ago]
+    check = FrozenCamera()
+    frozen: list[list[int]] = [[], []]
+    for k, (left, right) in enumerate(zip(*shown, strict=True)):
+        if check.left_is_frozen(k, left, right):
+            frozen[0].append(k)
+        elif not check.right_usable:
+            frozen[1].append(k)
+    assert frozen[camera] == [8, 12]
+    assert not frozen[1 - camera]
+
+
+def test_what_both_cameras_or_dark_ones_show_again_freezes_none() -> None:
+    rng = np.random.default_rng(2)
+    views = [(_image(STEP_PX * k, rng), _image(STEP_PX * k + 10, rng)) for k in range(8)]
+    black = np.zeros_like(views[0][0])
+    check = FrozenCamera()
+    for k, (left, right) in enumerate([*views, *views[:4]]):
+        assert not check.left_is_frozen(k, left, right)
+        assert check.right_usable
+    check = FrozenCamera()
+    for k, (_, right) in enumerate(views):
+        assert not check.left_is_frozen(k, _image(STEP_PX * k, rng) if k % 3 else black, right)

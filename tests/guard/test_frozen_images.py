@@ -158,6 +158,30 @@ def test_a_bit_equal_pair_is_a_repetition_where_the_imu_moves() -> None:
     assert (repeated.of_index, repeated.exact) == (0, True)
 
 
+@pytest.mark.parametrize("ago", [2, 4])
+def test_a_pair_of_some_frames_ago_is_a_repetition_where_the_imu_moves(ago: int) -> None:
+    """As of a ring of buffers that is read at the wrong place."""
+    frozen = _watching()
+    k = 1 - ago
+    again = _frame(1, _shifted(LEFT, 5.0 * k), _shifted(RIGHT, 5.0 * k))
+    assert frozen.check(again, _expected()) == Repeated(k, True, older=True)
+    line = RepeatReport(IMAGES).frame(again, Repeated(k, True, older=True))
+    assert f"as in frame {k} although the rig moves" in line[0]
+    new = _frame(2, _shifted(LEFT, 5.0), _shifted(RIGHT, 5.0))
+    assert frozen.check(new, _expected()) is None
+
+
+@pytest.mark.parametrize("shaking", [False, True])
+def test_what_a_rig_at_standstill_sees_again_is_new_and_so_are_black_images(shaking: bool) -> None:
+    frozen = _watching(shaking=shaking)
+    for k in range(1, 8):
+        other = np.zeros_like(LEFT) if shaking else _texture(9)
+        image = other if k % 2 else _texture(10 + k * shaking)
+        assert frozen.check(_frame(k, image, image), _expected()) is None
+        count = 0 if shaking else len(IDS)
+        frozen.observations(observations(k, k * STEP_NS, IDS[:count], Z[:count]))
+
+
 def test_a_bit_equal_pair_is_used_at_standstill() -> None:
     """A camera without noise: the IMU reads noise and gravity."""
     assert _watching(shaking=False).check(_frame(1, LEFT, RIGHT), _expected(0.0)) is None
@@ -203,7 +227,7 @@ def test_images_of_another_size_are_no_repetition() -> None:
     """
     frozen = _watching()
     assert frozen.check(_frame(1, LEFT[::2, ::2].copy(), RIGHT), _expected()) is None
-    assert frozen.check(_frame(2, LEFT, RIGHT), _expected()) is None
+    assert frozen.check(_frame(2, _texture(2), _texture(3)), _expected()) is None
 
 
 def test_one_camera_that_repeats_is_not_a_repeated_pair() -> None:

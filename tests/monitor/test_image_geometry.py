@@ -174,6 +174,21 @@ def test_it_is_looked_for_where_features_are_off_or_lost() -> None:
     assert [f.frame for f in _found(few, 1.0)] == [4]
 
 
+@pytest.mark.parametrize("change", [(1.0, 1.0, 24.0, 0.0), (1.0, 1.0, 0.0, -24.0)])
+def test_a_shift_is_known_where_depths_are_alike_and_a_scale_would_do_as_well(
+    change: tuple[float, ...],
+) -> None:
+    p = _points(2, 1.9, 2.3, 60)
+    frames = [_frame(k, p, change if k >= 4 else NONE) for k in range(6)]
+    free = _between(CAMERA, *frames[3:5])
+    assert free is not None
+    assert not free.known.all()  # control: not by all that may have changed
+    found = _found(frames)
+    assert [f.frame for f in found] == [4]
+    shifts = [found[0].figures["right_px"], found[0].figures["down_px"]]
+    np.testing.assert_allclose(shifts, change[2:], atol=3.0)
+
+
 def test_too_few_features_and_one_camera_do_not_tell() -> None:
     change = CHANGES[0]
     for count, found in ((30, 1), (29, 0)):

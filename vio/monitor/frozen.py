@@ -3,7 +3,8 @@ them again.
 
 Equal to the last bit is the same exposure, as noise differs from one to the next, unless images
 without noise, of a simulator, show a rig at standstill: what moved up to the frame before has not
-stopped at once. By images alone, a rig that crept and did not slow down may have: the first such
+stopped at once. A ring of buffers that is read at the wrong place gives an earlier exposure than the
+last one again. By images alone, a rig that crept and did not slow down may have: the first such
 frames are left out, and nothing is said of them. Nearly equal
 pairs (encoded again, or with noise on top) are the same where the tracked corners have not moved,
 while the motion predicted since the last frame moves them by more than its uncertainty allows and
@@ -23,6 +24,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, lengths, se3_log
+from vio.guard.exposure import exposure_digest
 from vio.imu.standstill import STANDSTILL_S, blocks_agree
 from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Capacity
@@ -62,6 +64,9 @@ class _FlowRules(NamedTuple):
     unmoved_px: float = 0.15  # the flow of an unmoved corner under noise of a few gray levels
     unmoved_share: float = 0.8  # of the corners that must be unmoved
     first_rows: Capacity[int] = 8  # compared before all others
+    # Earlier frames of a ring of buffers, and which of their rows are remembered.
+    ring_frames: Capacity[int] = 16
+    ring_stride_px: Capacity[int] = 32
     # The newest, at most and at least, of which so many have not moved, each between two that have …
     twice_frames: int = 12
     min_twice_frames: int = 8
@@ -122,6 +127,7 @@ class Repeated:
     exact: bool  # equal to the last bit
     certain: bool = True  # False: a rig that crept and has stopped at once looks the same
     since: int | None = None  # first frame of others like it, that were used; None: there are none
+    older: bool = False  # others were shown since that frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +145,8 @@ class FrozenImages:
     def __init__(self) -> None:
         self._imu: list[ImuSample] = []  # the last half second
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
+        # numbers of the last frames that are none, and some of their rows
+        self._ring = deque[tuple[int, bytes]](maxlen=_FLOW.ring_frames)
         self._seen: Observations | None = None  # its features
         # median flow of them, and of those of the frame before; None: too few were seen twice
         self._flow_px: float | None = None
@@ -197,10 +205,12 @@ class FrozenImages:
         Frames come in time order, with or without images, each with the back end's prediction,
         whose motion is that since the last frame with features.
         """
-        self._repeating = self._compare(frame, expected)
+        rows = _digest(frame)
+        self._repeating = self._compare(frame, expected) or self._older(rows, expected)
         self._expected = expected
         if self._repeating is None:
             self._shown = frame
+            self._ring.append((frame.index, rows))
         else:
             self._flows.append(_Flow(frame.index, 0.0, None))
         return self._repeating
@@ -261,6 +271,13 @@ class FrozenImages:
         if all(_equal(new, old) for new, old in zip(images, before, strict=True)):
             return self._judge_equal(frame, shown, expected)
         return self._judge_changed(frame, shown, expected)
+
+    def _older(self, rows: bytes, expected: Prediction | None) -> Repeated | None:
+        """Return which frame before the last one shows the same rows, while the rig moves."""
+        for index, shown in list(self._ring)[:-1]:
+            if rows and rows == shown and self._moves(expected):
+                return Repeated(index, True, older=True)
+        return None
 
     def _judge_equal(
         self, frame: StereoFrame, shown: StereoFrame, expected: Prediction | None
@@ -370,6 +387,15 @@ def _equal(a: Image, b: Image) -> bool:
     need no more.
     """
     return np.array_equal(a[: _FLOW.first_rows], b[: _FLOW.first_rows]) and np.array_equal(a, b)
+
+
+def _digest(frame: StereoFrame) -> bytes:
+    """What tells some rows of a frame's images from those of other exposures and sizes; empty where
+    these rows have one gray value each.
+    """
+    images = _images(frame)
+    digest = exposure_digest([image[:: _FLOW.ring_stride_px] for image in images])
+    return digest and str([image.shape for image in images]).encode() + digest
 
 
 def _motion(before: Observations, now: Observations | TrackPrior) -> _Motion:
@@ -496,13 +522,14 @@ class RepeatReport:
                 f"left out, {self._words.effect}"
             ]
         seen = self._seen(frame, exact=repeated.exact)
+        when = "as in" if repeated.older else "since"
         cause = (
             self._words.cause
             if repeated.exact
             else f"{self._words.cause}, or it sees only what moves with it"
         )
         return [
-            f"frame {frame.index}: {seen} since frame {repeated.of_index} although the rig moves: "
+            f"frame {frame.index}: {seen} {when} frame {repeated.of_index} although the rig moves: "
             f"{cause}; "
             f"left out, {self._words.effect}"
         ]

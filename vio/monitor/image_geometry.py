@@ -3,12 +3,14 @@
 A stream that negotiates another size, a driver that bins pixels, or a zoom lens changes where the
 calibration holds. Points of known depth then move by a share of their distance from the principal
 point, or all by the same pixels, which no motion of a rig explains. Both are fitted, beside the
-motion, where features lie far from where they were predicted.
+motion, where features lie far from where they were predicted. Where few features or a flat scene
+leave the fit of both unknown, a shift alone or a scale alone decides that explains the pixels as well.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +45,9 @@ class _GeometryRules(NamedTuple):
     share_uncertain: float = 0.3
     min_growth: float = 0.005
     min_shift_px: float = 3.0
+    # variance of the pixels by a simple change, over that by a free one, up to which it explains them
+    # as well
+    as_well: float = 1.3
     # how far all disparities may be off: by as much, times the way over the baseline, so may pixels
     disparity_px: float = 1.0
 
@@ -51,6 +56,9 @@ _RULES = _GeometryRules()
 _CODE = "image-geometry-changed"
 _MIN_DEPTH_M: Tolerance[float] = 0.05
 _NONE = np.array([1.0, 1.0, 0.0, 0.0])
+# What may change (4, K), of `_Change.value`: all of it, the shifts, or one scale of columns and rows.
+_FREE = np.eye(4)
+_SIMPLE = _FREE[:, 2:], np.array([[1.0], [1.0], [0.0], [0.0]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +68,7 @@ class _Change:
     value: FloatArray  # (4,) growth of columns and rows about the principal point, their shifts, px
     least: FloatArray  # (4,) up to which it counts as none, however well it is known
     limit: FloatArray  # (4,) likewise, as it is known
+    variance: float  # of the pixels, px^2
 
     @property
     def known(self) -> BoolArray:
@@ -77,8 +86,8 @@ class _Change:
     def beyond(self, size: FloatArray, limit: FloatArray) -> _Change:
         """What is known of it beyond sizes (4,) either way, by the larger one of two limits."""
         left = np.copysign(np.maximum(np.abs(self.value) - size, 0.0), self.value)
-        change = _Change(left, self.least, np.maximum(self.limit, limit))
-        return _Change(np.where(change.known, left, 0.0), change.least, change.limit)
+        change = replace(self, value=left, limit=np.maximum(self.limit, limit))
+        return replace(change, value=np.where(change.known, left, 0.0))
 
 
 class ImageGeometry:
@@ -109,14 +118,8 @@ class ImageGeometry:
         is_looked_at = is_off or self._changed
         if not is_looked_at and len(seen) > _RULES.left_share * len(frames[1]):
             return []
-        change = _between(self._camera, frames[1], seen)
-        if change is None or not change.is_clear:
-            return []
-        usual = _between(self._camera, frames[0], frames[1])
-        if usual is None:
-            return []
-        change = change.beyond(np.abs(usual.value - counted), usual.limit)
-        if not change.is_clear:
+        change = self._change(counted)
+        if change is None:
             return []
         self._counted = change.value
         factors = 1.0 + change.value[:2]
@@ -132,21 +135,68 @@ class ImageGeometry:
             ]
         return [_changed(seen.frame_index, self._since_first)]
 
+    def _change(self, counted: FloatArray) -> _Change | None:
+        """By how much the last frame clearly differs from the one before, less what that differed
+        from the one before it beyond what was `counted` (4,); None: nothing is clear.
+        """
+        first, before, seen = self._frames
+        points = _shared_points(self._camera, before, seen)
+        if points is None:
+            return None
+        free = _fitted(self._camera, *points)
+        if free is None:
+            return None
+        candidates = [(free, _FREE)]
+        if not free.known.all():
+            simple = [(_fitted(self._camera, *points, kind), kind) for kind in _SIMPLE]
+            as_well = _RULES.as_well * free.variance
+            candidates += [
+                (c, kind) for c, kind in simple if c is not None and c.variance < as_well
+            ]
+        for change, kind in candidates:
+            if not change.is_clear:
+                continue
+            usual = _between(self._camera, first, before, kind)
+            if usual is None:
+                continue
+            change = change.beyond(np.abs(usual.value - counted), usual.limit)
+            if change.is_clear:
+                return change
+        return None
 
-def _between(camera: StereoCamera, before: Observations, after: Observations) -> _Change | None:
-    """How the geometry of images differs between two frames; None: they do not tell."""
+
+def _between(
+    camera: StereoCamera, before: Observations, after: Observations, kind: FloatArray = _FREE
+) -> _Change | None:
+    """How the geometry of images differs between two frames, of what may change; None: they do not
+    tell.
+    """
+    points = _shared_points(camera, before, after)
+    return None if points is None else _fitted(camera, *points, kind)
+
+
+def _shared_points(
+    camera: StereoCamera, before: Observations, after: Observations
+) -> tuple[FloatArray, FloatArray] | None:
+    """The points (N, 3) of the frame before that another one shows, and their pixels (N, 3)
+    [ul vl ur] in it; None: there are few.
+    """
     old, new = shared_rows(before.ids, after.ids)
     usable = before.has_right[old] & after.has_right[new]
     usable &= ~(before.stale[old] | after.stale[new])
     p, valid = triangulate(camera, before.z[old[usable]], min_disparity_px=DEPTH_DISPARITY_PX)
     if int(valid.sum()) < _RULES.min_features:
         return None
-    return _fitted(camera, p[valid], after.z[new[usable][valid], :3])
+    return p[valid], after.z[new[usable][valid], :3]
 
 
-def _fitted(camera: StereoCamera, p: FloatArray, z: FloatArray) -> _Change | None:
+def _fitted(
+    camera: StereoCamera, p: FloatArray, z: FloatArray, kind: FloatArray = _FREE
+) -> _Change | None:
     """Fit a motion and a change of geometry to points (N, 3) of the frame before and pixels (N, 3)
     [ul vl ur], with Cauchy's weights; None: they do not determine them.
+
+    `kind` (4, K): the columns that a change is made of.
     """
     center = np.array([camera.cu, camera.cv, camera.cu])
     of_columns = np.array([1.0, 0.0, 1.0])
@@ -166,6 +216,7 @@ def _fitted(camera: StereoCamera, p: FloatArray, z: FloatArray) -> _Change | Non
         J[:, :, 7] = off * of_rows
         J[:, :, 8] = of_columns
         J[:, :, 9] = of_rows
+        J = np.concatenate([J[:, :, :6], J[:, :, 6:] @ kind], axis=2)
         equations = cauchy_equations(r, J, _RULES.least_px)
         try:
             inverse = np.linalg.inv(equations.matrix)
@@ -175,11 +226,12 @@ def _fitted(camera: StereoCamera, p: FloatArray, z: FloatArray) -> _Change | Non
         if not np.isfinite(step).all():
             return None
         T = se3_exp(step[:6]) @ T
-        value = value + step[6:]
+        value = value + kind @ step[6:]
     # of Cauchy's weights, which half of the features of normal errors have halved
-    of_change = 2.0 * equations.variance * inverse.diagonal()[6:]
-    if not (of_change > 0.0).all():
+    of_kind = 2.0 * equations.variance * inverse.diagonal()[6:]
+    if not (of_kind > 0.0).all():
         return None
+    of_change = kind**2 @ of_kind
     off_px = _RULES.disparity_px * length(T[:3, 3]) / camera.baseline_m
     least = np.array(
         [
@@ -189,7 +241,8 @@ def _fitted(camera: StereoCamera, p: FloatArray, z: FloatArray) -> _Change | Non
             _RULES.min_shift_px + off_px,
         ]
     )
-    return _Change(value, least, np.maximum(least, _RULES.sigmas * np.sqrt(of_change)))
+    limit = np.maximum(least, _RULES.sigmas * np.sqrt(of_change))
+    return _Change(value, least, limit, equations.variance)
 
 
 def _changed(index: int, since_first: FloatArray) -> Finding:
