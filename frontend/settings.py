@@ -51,8 +51,8 @@ class ConsensusSettings(Section):
 
 @dataclass(frozen=True, slots=True)
 class KltSettings(Section):
-    """Corners tracked by pyramidal Lucas-Kanade; the defaults suit images from 640x360 to
-    1242x375.
+    """The images, for `orb`, `sift` and `kornia` too, and the pyramid of Lucas-Kanade; the defaults
+    suit images from 640x360 to 1242x375.
     """
 
     section: ClassVar[str] = "frontend.klt"
@@ -75,7 +75,7 @@ class MatchSettings(Section):
     section: ClassVar[str] = "frontend.match"
 
     max_keypoints: int = setting(
-        1200, "key points extracted from each image", at_least=1, at_most=20000
+        1200, "key points extracted from each left image", at_least=1, at_most=20000
     )
 
 

@@ -77,7 +77,7 @@ class Measures:
     constants: tuple[str, ...]  # "module NAME"
     deciding: tuple[str, ...]  # those of no kind
     functions: tuple[FunctionForm, ...]
-    klt_imports: tuple[str, ...]
+    tracking_imports: tuple[str, ...]
     edges: tuple[tuple[str, str], ...]
     wrong: tuple[tuple[str, str], ...]
 
@@ -121,7 +121,7 @@ def measure(root: Path) -> Measures:
         constants=tuple(constants),
         deciding=tuple(deciding),
         functions=tuple(functions),
-        klt_imports=tuple(b for a, b in edges if a == "vio.frontend.klt"),
+        tracking_imports=tuple(b for a, b in edges if a == "vio.frontend.tracking"),
         edges=tuple(edges),
         wrong=tuple(wrong_way(edges)),
     )
@@ -239,7 +239,7 @@ def table(measures: Measures) -> str:
         f"(the most: {max(arguments, default=0)})",
         f"functions of complexity above {MAX_COMPLEXITY}": f"{above} ({above / max(many, 1):.1%})",
         f"functions of complexity above {MAX_COMPLEXITY_ANYWHERE}": f"{far_above}",
-        "modules that `frontend/klt.py` imports": f"{len(measures.klt_imports)}",
+        "modules that `frontend/tracking.py` imports": f"{len(measures.tracking_imports)}",
         "imports between modules": f"{len(measures.edges):,}",
         "imports between parts": f"{len(between):,}",
         "imports of a part above": f"{len(measures.wrong)}",
