@@ -267,7 +267,51 @@ def cut_patches(image: Image, centres: FloatArray, radius: int) -> Patches:
     made of them.
     """
     side = 2 * radius + 3
-    return warped_patches(image, shift_warps(centres), radius + 1).reshape(-1, side, side)
+    out = np.empty((len(centres), side, side), np.float32)
+    image = np.ascontiguousarray(image)
+    beyond = np.empty(len(centres), np.int64)
+    count = _cut_all(image, centres, out, beyond)
+    if count:
+        rows = beyond[:count]
+        at_border = warped_patches(image, shift_warps(centres[rows]), radius + 1)
+        out[rows] = at_border.reshape(-1, side, side)
+    return out
+
+
+@compiled
+def _cut_all(image: Image, centres: FloatArray, out: Patches, beyond: IntArray) -> int:
+    """Write patches (N, s, s) around points (N, 2), interpolated linearly; return the number of
+    those that reach beyond the image, whose rows are written into `beyond` (N,).
+    """
+    height, width = image.shape
+    side = out.shape[1]
+    radius = side // 2
+    count = 0
+    for n in range(len(centres)):
+        u = centres[n, 0] - radius
+        v = centres[n, 1] - radius
+        # False also for a point that is not finite.
+        if not (0.0 <= u < width - side - 0.001 and 0.0 <= v < height - side - 0.001):
+            beyond[count] = n
+            count += 1
+            continue
+        first = int(u)
+        top = int(v)
+        right = np.float32(u - first)
+        down = np.float32(v - top)
+        for y in range(side):
+            above = image[top + y, first : first + side + 1]
+            below = image[top + y + 1, first : first + side + 1]
+            row = out[n, y]
+            for x in range(side):
+                a = np.float32(above[x])
+                b = np.float32(above[x + 1])
+                c = np.float32(below[x])
+                d = np.float32(below[x + 1])
+                upper = a + right * (b - a)
+                lower = c + right * (d - c)
+                row[x] = upper + down * (lower - upper)
+    return count
 
 
 def rounded(centres: FloatArray) -> FloatArray:
