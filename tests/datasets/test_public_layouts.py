@@ -15,6 +15,7 @@ import vio
 from tests.plain_maker import STEP_S, make_plain
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
+from vio.datasets.sides import stamped_sides
 from vio.errors import CalibrationError, DataError
 
 FIRST_NS = 1700000000_000000000
@@ -77,6 +78,17 @@ def test_images_of_two_cameras_that_fit_in_no_pairs_are_not_those_of_one(tmp_pat
         open_dataset(path)
 
 
+def test_turns_to_both_sides_are_those_of_one_camera(tmp_path: Path) -> None:
+    names = [
+        f"turn_{word}_{FIRST_NS + k * 50_000_000}"
+        for k, word in enumerate(["left"] * 4 + ["right"] * 4)
+    ]
+    assert stamped_sides(names) is None
+
+    both = [stamped(side, k, 20_000_000) for side in (0, 1) for k in range(4)]
+    assert stamped_sides(both) == (both[:4], both[4:])
+
+
 def test_a_number_in_the_word_of_a_side_is_no_frame(tmp_path: Path) -> None:
     names = ("town_000000_{k:06d}_leftImg8bit.png", "town_000000_{k:06d}_rightImg8bit.png")
     make_plain(
@@ -112,6 +124,9 @@ def test_a_list_of_times_may_have_another_name(name: str, tmp_path: Path) -> Non
         ("imu_timestamps.txt", 4),
         ("right/timestamps_right.txt", 4),
         ("exposures.txt", 4),
+        ("exposure_times.txt", 4),
+        ("wheel_timestamps.csv", 4),
+        ("ground_truth_times.txt", 4),
     ],
 )
 def test_other_lists_are_not_taken_for_times(name: str, rows: int, tmp_path: Path) -> None:

@@ -32,10 +32,15 @@ from vio.records import NS_PER_S, IntArray
 _MIN_LEFT_OUT = 10  # numbers between the last image and the first one of such a recording
 _MIN_FULL = 999  # the largest number of a camera's counter has so many nines, or more
 TIME_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "left_images.txt")
-# in the names of lists that are not of the images
-_OTHER_SENSORS = frozenset(
-    ("imu", "gyro", "accel", "gps", "gnss", "lidar", "velodyne", "depth", "events", "pose", "poses")
-)
+# in the names of lists of times that are not those of images
+_OTHER_TIMES = frozenset(
+    (
+        "imu", "gyro", "accel", "mag", "baro", "gps", "gnss", "lidar", "velodyne", "radar", "sonar",
+        "depth", "events", "wheel", "wheels", "encoder", "encoders", "odom", "odometry", "pose", "poses",
+        "mocap", "vicon", "groundtruth", "ground", "gt", "truth", "exposure", "exposures", "shutter",
+        "processing",
+    )
+)  # fmt: skip
 _LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
 _TIMED = 100  # images, of which names that are times show it
 _LIST_FORM = "timestamp [ns], filename"
@@ -482,15 +487,15 @@ def _list_of_another_name(
 
 
 def _is_named_list(file: Path) -> bool:
-    """Tell whether a file is a table whose name says that it holds times, of no other sensor and not
-    of the right camera.
+    """Tell whether a file is a table whose name says that it holds times, not those of another
+    sensor, of exposures or of the right camera.
     """
     if file.suffix.lower() not in (".txt", ".csv") or not file.is_file():
         return False
     words = re.findall(r"[a-z]+", file.stem.lower())
     return (
         any(re.fullmatch("time|times|(?:time)?stamps?", word) for word in words)
-        and not set(words) & _OTHER_SENSORS
+        and not set(words) & _OTHER_TIMES
         and side_word(file.stem) != "right"
     )
 
