@@ -176,6 +176,9 @@ def test_a_source_is_one_path(source: object) -> None:
         ((600.0, 180.0), (370, 1200), "are exchanged"),
         ((600.0, 180.0), (1200, 370), None),
         ((-20.0, 180.0), (1200, 370), None),  # as of a part that was cut out of an image
+        ((640.0, 360.0), (600, 720), None),  # as of the left side of one
+        ((500.0, 200.0), (480, 640), None),
+        ((200.0, 260.0), (640, 240), None),
     ],
 )
 def test_a_principal_point_of_exchanged_numbers_is_refused(
