@@ -135,6 +135,18 @@ def test_other_lists_are_not_taken_for_times(name: str, rows: int, tmp_path: Pat
     assert any("no times.txt" in note for note in recording.notes)
 
 
+@pytest.mark.parametrize(
+    "names", [("cam0_times.txt", "cam1_times.txt"), ("times_l.csv", "times_r.csv")]
+)
+def test_of_lists_of_both_cameras_the_left_ones_counts(
+    names: tuple[str, str], tmp_path: Path
+) -> None:
+    path = with_list(tmp_path, names[0], 4)
+    times = [float(line) + 400 for line in (path / names[0]).read_text().split()]
+    (path / names[1]).write_text("".join(f"{time:.3f}\n" for time in times))
+    assert int(open_dataset(path).recording.frame_times_ns[0]) == FIRST_NS
+
+
 def test_lists_that_differ_are_not_taken_for_times(tmp_path: Path) -> None:
     path = with_list(tmp_path, "image_times.txt", 4)
     (path / "sync_times.txt").write_text("".join(f"{0.1 * k + 5}\n" for k in range(4)))

@@ -19,7 +19,7 @@ from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImagePairs
 from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.lost_images import CountedApart
-from vio.datasets.sides import frame_words, side_word, without_side
+from vio.datasets.sides import frame_words, pairs_of, side_word, split_sides, without_side
 from vio.datasets.tables import drive_times, is_date, table_rows
 from vio.datasets.unused import Layout
 from vio.errors import DataError
@@ -477,6 +477,10 @@ def _list_of_another_name(
     for file in listed:
         with contextlib.suppress(DataError):
             found[file] = times_of(file, pairs)
+    named = {file.stem: file for file in found}
+    for pair in pairs_of(list(named)):
+        if split_sides(pair) is not None:  # of cam0 and cam1
+            found.pop(named[pair[1]], None)
     if not found:
         return None
     file, times_ns = next(iter(found.items()))
