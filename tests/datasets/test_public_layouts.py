@@ -84,6 +84,7 @@ def test_turns_to_both_sides_are_those_of_one_camera(tmp_path: Path) -> None:
         for k, word in enumerate(["left"] * 4 + ["right"] * 4)
     ]
     assert stamped_sides(names) is None
+    assert stamped_sides([]) is None
 
     both = [stamped(side, k, 20_000_000) for side in (0, 1) for k in range(4)]
     assert stamped_sides(both) == (both[:4], both[4:])

@@ -111,7 +111,7 @@ def stamped_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
         sides[side].append(name)
         counts[side].append(tuple(int(word) for word in frame if word.isdigit()))
     fewest, most = sorted(map(len, sides.values()))
-    if 2 * fewest < most:
+    if not fewest or 2 * fewest < most:
         return None
     if max(map(min, counts.values())) > min(map(max, counts.values())):
         return None
