@@ -113,5 +113,5 @@ def test_this_checkout_is_measured(
     assert f"| code lines | {measures.code_lines:,} |" in printed
     assert measures.code_lines > 10_000
     assert len(measures.edges) > 1000
-    assert "vio.records" in measures.klt_imports
+    assert "vio.geometry.stereo" in measures.klt_imports
     assert all(form.place in printed for form in measures.functions_with_many_arguments())
