@@ -541,6 +541,12 @@ def test_an_unknown_option_shows_the_usage_of_its_command(
     [
         (["run", "a", "results"], "results; if results go there, write --out results"),
         (["run", "a", "--set", "msckf.clones", "5"], "5; write --set msckf.clones=5"),
+        (["run", "a", "lag_frames=1"], "lag_frames=1; write --set lag_frames=1\n"),
+        (
+            ["run", "a", "--set", "lag_frames=1", "motion=none"],
+            "motion=none; write --set motion=none\n",
+        ),
+        (["run", "a", "--set", "b=c", "--set", "lag_frames", "1"], "1; write --set lag_frames=1\n"),
         (["calibrate", "a", "--stop", "5"], "--stop 5\n"),  # no other option is like it
     ],
 )

@@ -120,6 +120,13 @@ def test_a_pickled_dictionary_is_read_as_the_archive(frames: int, tmp_path: Path
         np.testing.assert_array_equal(ours.angular, expected.angular)
 
 
+def test_lists_of_other_lengths_beside_the_arrays_are_passed_over(tmp_path: Path) -> None:
+    path = make_npy(
+        tmp_path / "a.npy", ece276a_new_arrays(make_drive(6)), seen_by=[[1, 2], [3]], of={"a": 1}
+    )
+    assert open_dataset(path).recording.kind == "ece276a"
+
+
 def test_extrinsics_of_cameras_that_look_along_x_are_turned(tmp_path: Path) -> None:
     arrays = ece276a_new_arrays(make_drive(6))
     forward = np.eye(4)  # x forward, y left, z up, from the image's x right, y down, z forward

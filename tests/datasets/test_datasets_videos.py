@@ -207,6 +207,20 @@ def test_each_video_may_lie_in_a_folder_of_its_own(videos: Path, tmp_path: Path)
     assert_same_events(together, moved, 0, 3)
 
 
+@pytest.mark.parametrize("name", ["timestamps.txt", "output.csv"])
+def test_a_list_of_times_beside_each_video_in_its_folder_is_read(
+    name: str, videos: Path, tmp_path: Path
+) -> None:
+    path = copy_of(videos, tmp_path / "v", "times.txt")
+    for side in ("left", "right"):
+        (path / side).mkdir()
+        (path / f"{side}.avi").rename(path / side / "output.avi")
+        shutil.copy(videos / "times.txt", path / side / name)
+    moved, together = open_dataset(path), open_dataset(videos)
+    assert_same_events(together, moved, 0, 3)
+    assert not any("no times.txt" in note for note in moved.recording.notes)
+
+
 def write_uneven(path: Path, images: list[np.ndarray], ticks: list[int]) -> None:
     """Write gray images as JPEG, image k presented at a multiple of 50 ms."""
     size = images[0].shape[1], images[0].shape[0]

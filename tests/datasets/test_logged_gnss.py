@@ -64,6 +64,27 @@ PHONE = "time,seconds_elapsed,horizontalAccuracy,speed,bearing,altitude,longitud
             False,
         ),
         ("time_ns,alt,lat,lon", lambda t, a, o, h: f"{t},{h!r},{a!r},{o!r}", False),
+        # units of a short table, the time behind what it belongs to, and a name with "vel" in it
+        (
+            "time_ns,lat [rad],lon [rad],alt (mm)",
+            lambda t, a, o, h: f"{t},{math.radians(a)!r},{math.radians(o)!r},{1e3 * h!r}",
+            False,
+        ),
+        (
+            "altitude(feet),lat,lon,x,y,z,w,time_ns",
+            lambda t, a, o, h: f"{h / 0.3048!r},{a!r},{o!r},1,1,1,1,{t}",
+            False,
+        ),
+        (
+            "time_ns,lat,lon,altitude_above_sea_level,x,y,z,w",
+            lambda t, a, o, h: f"{t},{a!r},{o!r},{h!r},1,1,1,1",
+            False,
+        ),
+        (  # a covariance that the message says is not known
+            f"{ECHOED},field.position_covariance_type",
+            lambda t, a, o, h: f"{t + 7},1,{t},gps,0,1,{a!r},{o!r},{h!r},{COVARIANCE},0",
+            False,
+        ),
     ],
 )  # fmt: skip
 def test_positions_are_found_by_the_names_of_columns(
@@ -77,21 +98,57 @@ def test_positions_are_found_by_the_names_of_columns(
     np.testing.assert_allclose(variances, expected, atol=2e-4)
 
 
-def test_messages_without_a_fix_are_left_out(tmp_path: Path) -> None:
+@pytest.mark.parametrize("status", [-1, -2])  # none, and not known yet
+def test_messages_without_a_fix_are_left_out(status: int, tmp_path: Path) -> None:
     path = written(
         tmp_path / "fix.csv", ECHOED,
-        lambda t, a, o, h: f"{t},1,{t},gps,{-1 if t == TIMES_NS[1] else 0},1,{a},{o},{h},{COVARIANCE}",
+        lambda t, a, o, h: f"{t},1,{t},gps,{status if t == TIMES_NS[1] else 0},1,{a},{o},{h},{COVARIANCE}",
     )  # fmt: skip
     fixes = read_gnss(path)
     assert fixes.times_ns.tolist() == [TIMES_NS[0], *TIMES_NS[2:]]
     assert any("1 rows say that there is no fix" in note for note in fixes.notes)
 
 
+def test_a_speed_is_no_height(tmp_path: Path) -> None:
+    path = written(
+        tmp_path / "gps.csv", "time_ns,lat,lon,speed", lambda t, a, o, h: f"{t},{a},{o},7"
+    )
+    assert not read_gnss(path).has_height.any()
+
+
+@pytest.mark.parametrize(
+    "kept", [20, 60]
+)  # letters of the last line: fewer columns than seven, more
+def test_a_last_line_that_was_cut_is_left_out(kept: int, tmp_path: Path) -> None:
+    path = written(
+        tmp_path / "fix.csv", ECHOED,
+        lambda t, a, o, h: f"{t},1,{t},gps,0,1,{a},{o},{h},{COVARIANCE}",
+    )  # fmt: skip
+    *rows, last = path.read_text().splitlines()
+    path.write_text("\n".join([*rows, last[:kept]]))
+    fixes = read_gnss(path)
+    assert fixes.times_ns.tolist() == TIMES_NS[:-1]
+    assert any("the last line ends too early" in note for note in fixes.notes)
+
+
+def test_letters_of_a_hemisphere_are_not_passed_over(tmp_path: Path) -> None:
+    path = written(
+        tmp_path / "gps.csv", "time_ns,latitude,N/S,longitude,E/W,height,a,b",
+        lambda t, a, o, h: f"{t},{a},S,{o},W,{h},1,2",
+    )  # fmt: skip
+    with pytest.raises(DataError, match=r"hemispheres by letters \(n/s, e/w\) are not read"):
+        read_gnss(path)
+
+
 @pytest.mark.parametrize(
     ("name", "header", "said"),
     [
-        ("a.csv", "time,x,y,z,a,b,c,d", "no header names columns of latitude and longitude"),
-        ("a.csv", "time,lat_gps,lat_rtk,lon,alt,a,b,c", "no header names columns of latitude"),
+        (
+            "a.csv",
+            "time,x,y,z,a,b,c,d",
+            "no header names one column of latitude and one of longitude",
+        ),
+        ("a.csv", "time,lat_gps,lat_rtk,lon,alt,a,b,c", "no header names one column of latitude"),
         ("a.gpx", "<gpx>", r"a\.gpx: GPX is not read; write its positions as a table time_s"),
         ("a.pos", "% GPST", r"a\.pos: RTKLIB's solution \(its time is that of GPS\) is not read"),
     ],

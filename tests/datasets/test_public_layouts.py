@@ -15,6 +15,7 @@ import vio
 from tests.plain_maker import STEP_S, make_plain
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
+from vio.datasets.sides import stamped_sides
 from vio.errors import CalibrationError, DataError
 
 FIRST_NS = 1700000000_000000000
@@ -77,6 +78,18 @@ def test_images_of_two_cameras_that_fit_in_no_pairs_are_not_those_of_one(tmp_pat
         open_dataset(path)
 
 
+def test_turns_to_both_sides_are_those_of_one_camera(tmp_path: Path) -> None:
+    names = [
+        f"turn_{word}_{FIRST_NS + k * 50_000_000}"
+        for k, word in enumerate(["left"] * 4 + ["right"] * 4)
+    ]
+    assert stamped_sides(names) is None
+    assert stamped_sides([]) is None
+
+    both = [stamped(side, k, 20_000_000) for side in (0, 1) for k in range(4)]
+    assert stamped_sides(both) == (both[:4], both[4:])
+
+
 def test_a_number_in_the_word_of_a_side_is_no_frame(tmp_path: Path) -> None:
     names = ("town_000000_{k:06d}_leftImg8bit.png", "town_000000_{k:06d}_rightImg8bit.png")
     make_plain(
@@ -112,12 +125,27 @@ def test_a_list_of_times_may_have_another_name(name: str, tmp_path: Path) -> Non
         ("imu_timestamps.txt", 4),
         ("right/timestamps_right.txt", 4),
         ("exposures.txt", 4),
+        ("exposure_times.txt", 4),
+        ("wheel_timestamps.csv", 4),
+        ("ground_truth_times.txt", 4),
     ],
 )
 def test_other_lists_are_not_taken_for_times(name: str, rows: int, tmp_path: Path) -> None:
     recording = open_dataset(with_list(tmp_path, name, rows)).recording
     assert int(recording.frame_times_ns[1]) == 100_000_000
     assert any("no times.txt" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize(
+    "names", [("cam0_times.txt", "cam1_times.txt"), ("times_l.csv", "times_r.csv")]
+)
+def test_of_lists_of_both_cameras_the_left_ones_counts(
+    names: tuple[str, str], tmp_path: Path
+) -> None:
+    path = with_list(tmp_path, names[0], 4)
+    times = [float(line) + 400 for line in (path / names[0]).read_text().split()]
+    (path / names[1]).write_text("".join(f"{time:.3f}\n" for time in times))
+    assert int(open_dataset(path).recording.frame_times_ns[0]) == FIRST_NS
 
 
 def test_lists_that_differ_are_not_taken_for_times(tmp_path: Path) -> None:
@@ -161,6 +189,9 @@ def test_a_source_is_one_path(source: object) -> None:
         ((600.0, 180.0), (370, 1200), "are exchanged"),
         ((600.0, 180.0), (1200, 370), None),
         ((-20.0, 180.0), (1200, 370), None),  # as of a part that was cut out of an image
+        ((640.0, 360.0), (600, 720), None),  # as of the left side of one
+        ((500.0, 200.0), (480, 640), None),
+        ((200.0, 260.0), (640, 240), None),
     ],
 )
 def test_a_principal_point_of_exchanged_numbers_is_refused(

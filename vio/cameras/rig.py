@@ -542,12 +542,14 @@ def rig_of_rectified(camera: StereoCamera, T_cam0_imu: FloatArray | None) -> Rig
 
 
 def _check_principal_point(camera: CameraModel) -> None:
-    """Raise CalibrationError where a principal point is outside of the image, and would not be with
-    its two numbers, or with width and height, in each other's place.
+    """Raise CalibrationError where a principal point is outside of the image, and would be in the
+    middle half of it with its two numbers, or with width and height, in each other's place.
+
+    It may be outside of a part that was cut out of an image, mostly far from there then.
     """
     inside = 0 < camera.cu < camera.width and 0 < camera.cv < camera.height
-    exchanged = 0 < camera.cv < camera.width and 0 < camera.cu < camera.height
-    if not inside and exchanged:
+    shares = camera.cv / camera.width, camera.cu / camera.height
+    if not inside and all(0.25 < share < 0.75 for share in shares):
         raise CalibrationError(
             f"the principal point {camera.cu:g}, {camera.cv:g} lies outside images of "
             f"{camera.width} x {camera.height} pixels: cu and cv, or width and height, are "

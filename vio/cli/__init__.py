@@ -170,17 +170,30 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         chosen = next(
             a for a in parser._actions if isinstance(a, argparse._SubParsersAction)
         ).choices[args.command]
-        first = unknown[0].partition("=")[0]
-        hint = ""
+        options = chosen._option_string_actions
+        first = unknown[0]
         if first.startswith("-"):
-            hint = _near(first, chosen._option_string_actions, _MEANT_OPTIONS)
-        elif "--set" in words and words[words.index("--set") + 1 :][1:2] == unknown[:1]:
-            hint = f"; write --set {words[words.index('--set') + 1]}={first}"
-        elif "--out" in chosen._option_string_actions and "--out" not in words:
-            hint = f"; if results go there, write --out {first}"
+            hint = _near(first.partition("=")[0], options, _MEANT_OPTIONS)
+        else:
+            hint = _place(first, words, options)
         chosen.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     args.command_line = shlex.join(["vio", *words])
     return args
+
+
+def _place(word: str, words: Sequence[str], options: Iterable[str]) -> str:
+    """Return a hint at where a word of a command line that is too much belongs; nothing where that is
+    not clear.
+    """
+    names = list(options)
+    if "=" in word:
+        return f"; write --set {word}" if "--set" in names else ""
+    for option, name, value in zip(words, words[1:], words[2:], strict=False):
+        if option == "--set" and value == word and "=" not in name:
+            return f"; write --set {name}={word}"
+    return (
+        f"; if results go there, write --out {word}" if {"--out"} & set(names) - set(words) else ""
+    )
 
 
 def _near(word: str, known: Iterable[str], meant: Mapping[str, str]) -> str:

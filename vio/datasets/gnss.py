@@ -14,6 +14,7 @@ from vio.datasets.bags.store import Bag
 from vio.datasets.gnss_fixes import UP_SHARE, GnssFixes, checked_fixes
 from vio.datasets.tables import (
     NumberTable,
+    column_count,
     drive_times,
     read_logged_table,
     read_table,
@@ -39,10 +40,18 @@ _PLACES = tuple(
         "(?:alt|altitude|height|elevation)",
     )
 )
-_NO_PLACE = re.compile("|".join((*_SIGMA_WORDS, "cov", "vel", "speed", "ref")))
+_NO_PLACE = re.compile("|".join((*_SIGMA_WORDS, "cov", "(?<!le)vel", "speed", "ref")))  # no level
 _RADIANS = re.compile(r"[^a-z]rad")
+# units of heights in names of columns, and their lengths in metres
+_LENGTHS_M = tuple(
+    (re.compile(rf"[^a-z](?:{names})(?:[^a-z]|$)"), length)
+    for names, length in (("ft|feet|foot", 0.3048), ("mm", 1e-3), ("cm", 1e-2), ("km", 1e3))
+)
+# columns of letters that say on which side of the equator and of Greenwich a position lies
+_HEMISPHERE = re.compile(r"\bn ?/ ?s\b|\be ?/ ?w\b|hemi|(?:lat|lon|lng)[a-z]*[ _.]?(?:dir|ref)")
 _STATUS = re.compile(r"(?:^|[^a-z])status[./]status$")
 _COVARIANCE = re.compile(r"position_covariance[^a-z]*\d\]?$")
+_COVARIANCE_KIND = re.compile(r"position_covariance_type$")
 _OTHER_FORMS = {
     ".gpx": "GPX",
     ".kml": "KML",
@@ -86,10 +95,9 @@ def _read_csv(path: Path) -> GnssFixes:
             f"{path}: {_OTHER_FORMS[path.suffix.lower()]} is not read; write its positions as a table "
             f"{_FORM}"
         )
-    width = _width_of_last_row(path)
-    if width > _MOST_COLUMNS:
+    if column_count(path) > _MOST_COLUMNS:
         return _read_logged(path)
-    columns = 4 if width == 4 else 7
+    columns = 4 if _width_of_last_row(path) == 4 else 7
     table = read_table(path, columns, _FORM)
     values = table.values
     if table.header:
@@ -120,14 +128,24 @@ def _read_logged(path: Path) -> GnssFixes:
     places = _places_in(table.header)
     if places is None:
         raise DataError(
-            f"{path}: no header names columns of latitude and longitude; name them, or write {_FORM}"
+            f"{path}: no header names one column of latitude and one of longitude; name them, or write "
+            f"{_FORM}"
         )
     values = table.values
+    sides = [
+        name
+        for k, name in enumerate(table.header[1:])
+        if _HEMISPHERE.search(name) and np.isnan(values[:, k]).all()
+    ]
+    if sides:
+        raise DataError(
+            f"{path}: hemispheres by letters ({', '.join(sides)}) are not read; write south and west "
+            "as negative degrees, without these columns"
+        )
     position = np.full((len(values), 3), np.nan)
     for k, column in enumerate(places):
         if column is not None:
-            scale = 180.0 / np.pi if k < 2 and _RADIANS.search(table.header[1 + column]) else 1.0
-            position[:, k] = scale * values[:, column]
+            position[:, k] = _unit(table.header[1 + column], k == 2) * values[:, column]
     times_ns = stamps_ns(table, _FIX_PACE, notes)
     fixed = _have_a_fix(table)
     if not fixed.all():
@@ -135,6 +153,13 @@ def _read_logged(path: Path) -> GnssFixes:
     return checked_fixes(
         times_ns[fixed], position[fixed], _covariance_in(table)[fixed], str(path), tuple(notes)
     )
+
+
+def _unit(name: str, is_height: bool) -> float:
+    """Return the unit that the name of a column states, in degrees, or in metres of a height."""
+    if is_height:
+        return next((length for unit, length in _LENGTHS_M if unit.search(name)), 1.0)
+    return 180.0 / np.pi if _RADIANS.search(name) else 1.0
 
 
 def _places_in(header: Sequence[str]) -> tuple[int, int, int | None] | None:
@@ -160,7 +185,7 @@ def _have_a_fix(table: NumberTable) -> BoolArray:
     status = [k for k, name in enumerate(table.header[1:]) if _STATUS.search(name)]
     if len(status) != 1:
         return np.ones(len(table.values), dtype=np.bool_)
-    return table.values[:, status[0]] != _NO_FIX
+    return ~(table.values[:, status[0]] <= _NO_FIX)
 
 
 def _covariance_in(table: NumberTable) -> FloatArray:
@@ -171,16 +196,24 @@ def _covariance_in(table: NumberTable) -> FloatArray:
     columns = [k for k, name in enumerate(names) if name]
     if len(columns) != 9:
         return np.full((len(table.values), 3, 3), np.nan)
-    return table.values[:, columns].reshape(-1, 3, 3)
+    covariance = table.values[:, columns].reshape(-1, 3, 3)
+    kinds = [k for k, name in enumerate(table.header[1:]) if _COVARIANCE_KIND.search(name)]
+    if len(kinds) == 1:
+        covariance[table.values[:, kinds[0]] == _UNKNOWN] = np.nan
+    return covariance
 
 
 def _order(header: Sequence[str]) -> tuple[int, int] | None:
     """Return which columns behind the stamp are latitude and longitude, by a header whose further
-    columns are height and standard deviations; None: it names others.
+    columns are height and standard deviations; None: it names others, or other units.
     """
     if len(header) < 3 or not re.search("time|stamp|^t$", header[0]):
         return None
     if any(not any(word in name for word in _SIGMA_WORDS) for name in header[4:]):
+        return None
+    if any(_NO_PLACE.search(name) for name in header[3:4]):  # a speed
+        return None
+    if any(_unit(name, k == 2) != 1.0 for k, name in enumerate(header[1:4])):
         return None
     for order in ((0, 1), (1, 0)):
         if "lat" in header[1 + order[0]] and re.search("lon|lng", header[1 + order[1]]):

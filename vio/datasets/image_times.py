@@ -19,7 +19,7 @@ from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import ImagePairs
 from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.lost_images import CountedApart
-from vio.datasets.sides import frame_words, side_word, without_side
+from vio.datasets.sides import frame_words, pairs_of, side_word, split_sides, without_side
 from vio.datasets.tables import drive_times, is_date, table_rows
 from vio.datasets.unused import Layout
 from vio.errors import DataError
@@ -32,10 +32,15 @@ from vio.records import NS_PER_S, IntArray
 _MIN_LEFT_OUT = 10  # numbers between the last image and the first one of such a recording
 _MIN_FULL = 999  # the largest number of a camera's counter has so many nines, or more
 TIME_LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "left_images.txt")
-# in the names of lists that are not of the images
-_OTHER_SENSORS = frozenset(
-    ("imu", "gyro", "accel", "gps", "gnss", "lidar", "velodyne", "depth", "events", "pose", "poses")
-)
+# in the names of lists of times that are not those of images
+_OTHER_TIMES = frozenset(
+    (
+        "imu", "gyro", "accel", "mag", "baro", "gps", "gnss", "lidar", "velodyne", "radar", "sonar",
+        "depth", "events", "wheel", "wheels", "encoder", "encoders", "odom", "odometry", "pose", "poses",
+        "mocap", "vicon", "groundtruth", "ground", "gt", "truth", "exposure", "exposures", "shutter",
+        "processing",
+    )
+)  # fmt: skip
 _LARGEST_COUNT = 10**9  # of frames: a year at 30 a second
 _TIMED = 100  # images, of which names that are times show it
 _LIST_FORM = "timestamp [ns], filename"
@@ -472,6 +477,10 @@ def _list_of_another_name(
     for file in listed:
         with contextlib.suppress(DataError):
             found[file] = times_of(file, pairs)
+    named = {file.stem: file for file in found}
+    for pair in pairs_of(list(named)):
+        if split_sides(pair) is not None:  # of cam0 and cam1
+            found.pop(named[pair[1]], None)
     if not found:
         return None
     file, times_ns = next(iter(found.items()))
@@ -482,15 +491,15 @@ def _list_of_another_name(
 
 
 def _is_named_list(file: Path) -> bool:
-    """Tell whether a file is a table whose name says that it holds times, of no other sensor and not
-    of the right camera.
+    """Tell whether a file is a table whose name says that it holds times, not those of another
+    sensor, of exposures or of the right camera.
     """
     if file.suffix.lower() not in (".txt", ".csv") or not file.is_file():
         return False
     words = re.findall(r"[a-z]+", file.stem.lower())
     return (
         any(re.fullmatch("time|times|(?:time)?stamps?", word) for word in words)
-        and not set(words) & _OTHER_SENSORS
+        and not set(words) & _OTHER_TIMES
         and side_word(file.stem) != "right"
     )
 

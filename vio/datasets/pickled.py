@@ -4,6 +4,7 @@ pickle may hold.
 
 from __future__ import annotations
 
+import contextlib
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
@@ -78,8 +79,8 @@ class _ArraysAlone(pickle.Unpickler):
 
 
 def read_pickled_arrays(path: Path) -> Mapping[str, np.ndarray]:
-    """Read the arrays of a dictionary that `numpy.save` pickled; members that are None are left
-    out.
+    """Read the arrays of a dictionary that `numpy.save` pickled; members that are None, or lists of
+    no array's form, are left out.
 
     Raises:
         DataError: the file is missing or damaged, or holds anything but arrays and numbers by name.
@@ -101,6 +102,10 @@ def read_pickled_arrays(path: Path) -> Mapping[str, np.ndarray]:
         raise DataError(
             f"{path}: holds no arrays by name, but {type(found).__name__}; save them with numpy.savez"
         )
-    arrays = {name: np.asarray(value) for name, value in found.items() if value is not None}
+    arrays = {}
+    for name, value in found.items():
+        with contextlib.suppress(ValueError):  # rows of different lengths
+            if value is not None:
+                arrays[name] = np.asarray(value)
     check_array_bytes({name: array.nbytes for name, array in arrays.items()}, path)
     return arrays

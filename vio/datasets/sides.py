@@ -98,16 +98,22 @@ def _in_pairs(
 def stamped_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
     """Return the names of left and right images that lie in one folder, where each has a word for its
     side and a time or number of its own (`front_left_0_1600000000250000000`); None: some have
-    none, or one side has less than half of the other.
+    none, one side has less than half of the other, or one begins when the other has ended, as turns
+    to the left and to the right of one camera do.
     """
     sides: dict[str, list[str]] = {"left": [], "right": []}
+    counts: dict[str, list[tuple[int, ...]]] = {"left": [], "right": []}
     for name in names:
         found = _frame_and_side(name, ())
         if found is None:
             return None
-        sides[found[1]].append(name)
+        frame, side = found
+        sides[side].append(name)
+        counts[side].append(tuple(int(word) for word in frame if word.isdigit()))
     fewest, most = sorted(map(len, sides.values()))
-    if 2 * fewest < most:
+    if not fewest or 2 * fewest < most:
+        return None
+    if max(map(min, counts.values())) > min(map(max, counts.values())):
         return None
     return sides["left"], sides["right"]
 

@@ -481,7 +481,7 @@ def read_sensor_table(
 
 def _sensor_table(path: Path, form: str, cut: list[str]) -> NumberTable:
     """Read the stamps and three readings, or the axes that the header names of more columns."""
-    count = _columns(path)
+    count = column_count(path)
     if count > _SENSOR_COLUMNS:
         table = _time_first(read_table(path, count, form, cut))
         axes = [_sensor_and_axis(cell)[1] for cell in table.header[1:]]
@@ -527,7 +527,7 @@ def names_readings(path: Path) -> str | None:
     """
     name = path.name.lower()
     try:
-        count = _columns(path)
+        count = column_count(path)
         if count >= _IMU_COLUMNS and ("imu" in name or _is_named_imu(path, count)):
             return "imu.csv"
     except DataError:
@@ -546,7 +546,7 @@ def _is_named_imu(path: Path, count: int) -> bool:
     return named >= set(itertools.product("wa", "xyz"))
 
 
-def _columns(path: Path) -> int:
+def column_count(path: Path) -> int:
     """Return the number of columns of a table; 0: it holds no line of data."""
     rows = (split_cells(undated(line.strip())) for _, line in lines_of(path))
     return next((len(fields) for fields in rows if _NUMBER.fullmatch(fields[0])), 0)
@@ -554,7 +554,7 @@ def _columns(path: Path) -> int:
 
 def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
     """Read the stamps and six readings, or what the header names of more columns."""
-    count = _columns(path)
+    count = column_count(path)
     if count <= _IMU_COLUMNS:
         return read_table(path, _IMU_COLUMNS, _IMU_FORM, cut)
     table = read_table(path, count, _IMU_FORM, cut)
@@ -574,7 +574,17 @@ def read_logged_table(path: Path, form: str, cut: list[str] | None = None) -> Nu
     """Read all columns of a table of messages or of a logger, with the time that its header names in
     front; see `read_table`.
     """
-    return _time_first(read_table(path, _columns(path), form, cut))
+    table = read_table(path, column_count(path), form, cut)
+    timed = _time_first(table)
+    if not table.header or table.header[0] in timed.header:
+        return timed
+    # what stood in the place of stamps is a column of numbers as the others
+    first = [float(cell) if _NUMBER.fullmatch(cell) else np.nan for cell in table.stamps]
+    return replace(
+        timed,
+        header=(*timed.header, table.header[0]),
+        values=np.column_stack([timed.values, first]),
+    )
 
 
 def _known_header(table: NumberTable) -> tuple[str, ...]:

@@ -121,9 +121,12 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     right = left if files[1] == files[0] else _facts(files[1])
     one = files[0] == files[1]
     own = None if one else _own_lists(path, files)
-    timed = own is not None or left.times_ns is not None or right.times_ns is not None
-    timed = timed or _times_of_frames(path, files) is not None
-    if not timed and abs(left.rate_hz - right.rate_hz) > 1e-3 * left.rate_hz:
+    stated_ns = None if own is not None else _times_of_frames(path, files)
+    known = (own, stated_ns, left.times_ns, right.times_ns)
+    if (
+        all(times is None for times in known)
+        and abs(left.rate_hz - right.rate_hz) > 1e-3 * left.rate_hz
+    ):
         raise DataError(
             f"{files[0]} has {left.rate_hz:g} and {files[1].name} {right.rate_hz:g} frames per "
             "second; record both "
@@ -138,7 +141,7 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     rig = load_rig(file, image_size=size, cameras=2)
     if one:
         _check_side_by_side(rig, left, files[0], file)
-    times_ns, times_file, rows, notes = _times(path, files, (left, right), own)
+    times_ns, times_file, rows, notes = _times(path, files, (left, right), own, stated_ns)
     if one:
         notes.append(f"{files[0].name} holds the left and the right image side by side")
     used = files if own is None else (*files, own[1])
@@ -162,12 +165,20 @@ def _check_side_by_side(rig: Rig, video: _Facts, path: Path, calibration: Path) 
 
 
 def _own_lists(path: Path, files: tuple[Path, Path]) -> tuple[Path, Path] | None:
-    """Return the list of times of each of two videos, named as it (`left.txt`,
-    `left_timestamps.csv`); None: there are not both.
+    """Return the list of times of each of two videos, beside it and named as it (`left.txt`,
+    `left_timestamps.csv`), or in a folder of its own (`left/timestamps.txt`); None: there are not both.
     """
-    lists = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _LIST_SUFFIXES]
-    named = {_LIST_WORDS.sub("", file.stem.lower()): file for file in lists}
-    left, right = (named.get(_LIST_WORDS.sub("", file.stem.lower())) for file in files)
+    found = []
+    for video in files:
+        lists = sorted(video.parent.iterdir())
+        named = {
+            _LIST_WORDS.sub("", file.stem.lower()): file
+            for file in lists
+            if file.suffix.lower() in _LIST_SUFFIXES
+        }
+        own = named.get(_LIST_WORDS.sub("", video.stem.lower()))
+        found.append(own or (named.get("") if video.parent != path else None))
+    left, right = found
     return None if left is None or right is None or left == right else (left, right)
 
 
@@ -243,6 +254,7 @@ def _times(
     files: tuple[Path, Path],
     facts: tuple[_Facts, _Facts],
     own: tuple[Path, Path] | None,
+    stated_ns: IntArray | None,
 ) -> tuple[IntArray, Path | None, IntArray, list[str]]:
     """Return the times (F,) of the pairs, the file that states them, the frames (F, 2) of each pair
     in both files, and notes.
@@ -252,6 +264,7 @@ def _times(
         files: both videos.
         facts: what they state.
         own: the list of times of each; None: there are not both.
+        stated_ns: times by Spectacular AI's record; None: there is none.
     """
     left, right = facts
     count = min(left.count, right.count)
@@ -274,7 +287,6 @@ def _times(
         return times_ns, file, rows, doubts + shorter
     if own is not None:
         return _times_of_own_lists(path, files, facts, own)
-    stated_ns = _times_of_frames(path, files)
     if stated_ns is not None:
         notes = list(shorter)
         if len(stated_ns) != count:
