@@ -23,7 +23,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Tolerance
-from vio.records import BoolArray, Image, TrackPrior
+from vio.records import BoolArray, Image, IntArray, TrackPrior
 
 
 class _MatchRules(NamedTuple):
@@ -33,6 +33,8 @@ class _MatchRules(NamedTuple):
     search_share: float = 0.06
     # key points closer to the image border are dropped: their patch would not fit
     border_px: float = 8.0
+    # of a feature from its key point, whose detection has about a pixel of error
+    same_px: float = 1.5
 
 
 _MATCHES = _MatchRules()
@@ -115,18 +117,21 @@ class KeypointFlow:
         good = (score >= MIN_CORRELATION) & on_peak(pixels, start)
         found[rows] = np.where(good[:, None], pixels, start)
         seen[rows] = True
-        self._descriptors[slots] = points.descriptors[described]
         return found, seen
 
     def keep(self, tracks: Tracks) -> None:
-        """Remember the descriptors of the features that a frame has added."""
+        """Remember the descriptors of the key points where a frame's features are.
+
+        A feature without one keeps its last one: that of a match elsewhere is another thing's.
+        """
         points = self._seen
         if self._descriptors is None or len(self._descriptors) < self._bank.size:
             self._descriptors = _grown(self._descriptors, points.descriptors, self._bank.size)
-        new = (tracks.age == 0).nonzero()[0]
-        if len(new) and len(points):
-            off = np.abs(tracks.left[new, None] - points.pixels).max(axis=2)
-            self._descriptors[tracks.slot[new]] = points.descriptors[off.argmin(axis=1)]
+        if len(points):
+            nearest = np.empty(len(tracks), dtype=np.int64)
+            _nearest_point(tracks.left, points.pixels, _MATCHES.same_px, nearest)
+            there = nearest >= 0
+            self._descriptors[tracks.slot[there]] = points.descriptors[nearest[there]]
 
     @property
     def _seen(self) -> Keypoints:
@@ -169,3 +174,18 @@ def _near_either(
         for j in range(len(us)):
             in_one = (abs(u - us[j]) <= reach) & (abs(v - vs[j]) <= reach)
             row[j] = in_one | ((abs(u_other - us[j]) <= reach) & (abs(v_other - vs[j]) <= reach))
+
+
+@compiled
+def _nearest_point(pixels: FloatArray, points: FloatArray, reach: float, nearest: IntArray) -> None:
+    """Write which point (M, 2) is nearest to each pixel (N, 2), in the maximum norm; -1: none is
+    within reach. Of equally near ones the first one counts.
+    """
+    for i in range(len(pixels)):
+        least = reach
+        nearest[i] = -1
+        for j in range(len(points)):
+            off = max(abs(pixels[i, 0] - points[j, 0]), abs(pixels[i, 1] - points[j, 1]))
+            if off < least or (off == least and nearest[i] < 0):
+                least = off
+                nearest[i] = j

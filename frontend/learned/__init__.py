@@ -49,8 +49,10 @@ def _warm_up(frontend: DescriptorFrontend, camera: StereoCamera) -> None:
     if camera.width is None or camera.height is None:
         return
     left = np.random.default_rng(0).integers(0, 256, (camera.height, camera.width), dtype=np.uint8)
+    right = np.roll(left, -8, axis=1) if camera.kind == "stereo" else None
+    depth = np.ones(left.shape) if camera.kind == "rgbd" else None
     for k in range(2):
-        frontend.process(StereoFrame(k, k * 10**8, left, np.roll(left, -8, axis=1)))
+        frontend.process(StereoFrame(k, k * 10**8, left, right, depth=depth))
 
 
 def _require_torch() -> None:

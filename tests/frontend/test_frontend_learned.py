@@ -20,6 +20,7 @@ from vio.frontend.descriptors import DescriptorFrontend
 from vio.frontend.keypoints import Keypoints, MutualNearest
 from vio.frontend.settings import FrontendSettings, GridSettings, LearnedSettings, MatchSettings
 from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, StereoFrame
 
 REASON = "not installed: the extra learned"
@@ -332,13 +333,15 @@ def test_pairs_in_a_window_equal_a_formula() -> None:
     # many at the limits
     a, b, guess = (rng.integers(0, 2 * np.array([40, 12]), (n, 2)) / 2 for n in (60, 70, 60))
     found = np.empty((60, 70), dtype=np.bool_)
-    descriptors._on_row(a, np.ascontiguousarray(b.T), 6.0, found)
-    disparity, rows = a[:, :1] - b[:, 0], np.abs(a[:, 1:] - b[:, 1])
-    np.testing.assert_array_equal(found, (rows <= 1.5) & (disparity >= 0.3) & (disparity <= 6.0))
     descriptors._near_either(guess, a, np.ascontiguousarray(b.T), 2.5, found)
     expected = [np.abs(centre[:, None] - b).max(axis=2) <= 2.5 for centre in (guess, a)]
     np.testing.assert_array_equal(found, expected[0] | expected[1])
     assert 0.01 < found.mean() < 0.5
+    nearest = np.empty(60, dtype=np.int64)
+    descriptors._nearest_point(a, b, 1.5, nearest)
+    off = np.abs(a[:, None] - b).max(axis=2)
+    np.testing.assert_array_equal(nearest, np.where(off.min(axis=1) <= 1.5, off.argmin(axis=1), -1))
+    assert 0.1 < (nearest < 0).mean() < 0.9
 
 
 # --- CUDA
@@ -365,6 +368,11 @@ def test_cuda_is_warmed_up_by_a_front_end_of_its_own(
     assert len(outputs) == 2
     assert outputs[0].matched > 20
     assert outputs[1].tracked > 20
+    for kind in ("rgbd", "mono"):
+        one: StereoCamera = replace(SMALL, kind=kind)
+        settings = FrontendSettings(match=MATCH, learned=LearnedSettings(device="cuda"))
+        learned.build_learned(one, settings)
+        assert outputs[-1].tracked > 20
     assert frontend.process(small_frame(0, flight(1)[0])).observations.ids[0] == 0
 
 

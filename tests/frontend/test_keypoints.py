@@ -17,7 +17,7 @@ from vio.frontend.keypoints import (
     spread_rows,
 )
 from vio.frontend.settings import FrontendSettings, GridSettings, MatchSettings
-from vio.records import Image
+from vio.records import BoolArray, Image, IntArray
 
 SETTINGS = FrontendSettings(
     grid=GridSettings(target_features=150), match=MatchSettings(max_keypoints=600)
@@ -92,3 +92,34 @@ def test_no_key_point_at_all_ends_the_features() -> None:
     assert len(seen[2]) > 100
     assert len(seen[3]) == 0
     assert len(seen[5]) > 100
+
+
+def test_a_wrong_match_does_not_give_a_feature_the_descriptor_of_another() -> None:
+    """It is rejected, and the feature followed by the motion of others: its own key point is found
+    in the next frame.
+    """
+    misled: list[np.ndarray] = []  # pixels of features in frame 3
+    right: list[bool] = []  # whether they are found in frame 4
+    count = 0
+
+    def match(a: Keypoints, b: Keypoints, allowed: BoolArray) -> IntArray:
+        nonlocal count
+        count += 1
+        pairs = MutualNearest()(a, b, allowed)
+        if count == 3:  # every third pair gets the key point of another
+            third = np.arange(0, len(pairs), 3)
+            misled.extend(truth(SLANTED, POSES[2], a.pixels[pairs[third, 0]], POSES[3])[:, :2])
+            pairs[third, 1] = np.roll(pairs[third, 1], 1)
+        if count == 4:
+            now = a.pixels[pairs[:, 0]]
+            expected = truth(SLANTED, POSES[3], now, POSES[4])[:, :2]
+            found = np.abs(b.pixels[pairs[:, 1]] - expected).max(axis=1) < 3.0
+            apart = np.abs(now[:, None] - np.array(misled)).max(axis=2).min(axis=1)
+            right.extend(found[apart < 1.0].tolist())
+        return pairs
+
+    frontend = DescriptorFrontend(CAMERA, SETTINGS, "orb", orb_extractor(SETTINGS.match), match)
+    for frame in FRAMES[:5]:
+        frontend.process(frame)
+    assert len(right) >= 5
+    assert np.mean(right) > 0.8

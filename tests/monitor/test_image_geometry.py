@@ -229,3 +229,26 @@ def test_a_change_that_is_not_known_well_is_not_named(sigma_px: float, named: bo
     change = (0.9, 0.9, 0.0, 0.0)
     frames = [_frame(k, p, change if k >= 3 else NONE, sigma_px=sigma_px) for k in range(4)]
     assert bool(_found(frames)) == named
+
+
+def _turned_past_an_object(seed: int, shift_px: float) -> list[Observations]:
+    """Two frames at rest, and one after a fast turn in which an object has moved, and the images
+    are shifted.
+    """
+    rng = np.random.default_rng(seed)
+    p = _points(seed, 2.0, 8.0, 300)
+    step = np.concatenate([0.1 * rng.normal(size=3), 0.3 * rng.normal(size=3) / np.sqrt(3.0)])
+    turned = _frame(1, p, step=step)
+    z = turned.z.copy()
+    moved = np.abs(z[:, 0] - rng.uniform(0.0, 640.0)) < 100.0
+    z[moved, :3] += np.array([8.0, 1.0, 10.0])
+    z[:, ::2] += shift_px
+    seen = np.all((z[:, :2] > 0.0) & (z[:, :2] < [640.0, 480.0]), axis=1)
+    still = [_frame(k, p, step=np.zeros(6)) for k in range(2)]
+    return [*still, observations(2, 2 * STEP_NS, turned.ids[seen], z[seen])]
+
+
+@pytest.mark.parametrize("seed", [6, 19, 20, 24, 58, 60])
+def test_a_change_that_explains_pixels_no_better_than_none_is_none(seed: int) -> None:
+    assert _found(_turned_past_an_object(seed, 0.0)) == []
+    assert len(_found(_turned_past_an_object(seed, 24.0))) == 1  # control
