@@ -109,6 +109,11 @@ def test_messages_without_a_fix_are_left_out(status: int, tmp_path: Path) -> Non
     assert any("1 rows say that there is no fix" in note for note in fixes.notes)
 
 
+def test_accuracies_that_are_not_read_are_named(tmp_path: Path) -> None:
+    path = written(tmp_path / "gps.csv", PHONE, lambda t, a, o, h: f"{t},0.5,4,1,2,{h},{o},{a}")
+    assert any("horizontalaccuracy: accuracies" in note for note in read_gnss(path).notes)
+
+
 def test_a_speed_is_no_height(tmp_path: Path) -> None:
     path = written(
         tmp_path / "gps.csv", "time_ns,lat,lon,speed", lambda t, a, o, h: f"{t},{a},{o},7"

@@ -51,6 +51,7 @@ _LENGTHS_M = tuple(
 _HEMISPHERE = re.compile(r"\bn ?/ ?s\b|\be ?/ ?w\b|hemi|(?:lat|lon|lng)[a-z]*[ _.]?(?:dir|ref)")
 _STATUS = re.compile(r"(?:^|[^a-z])status[./]status$")
 _COVARIANCE = re.compile(r"position_covariance[^a-z]*\d\]?$")
+_ACCURACY = re.compile(r"sigma|std|accuracy|^[hv]_?acc")  # in any form
 _COVARIANCE_KIND = re.compile(r"position_covariance_type$")
 _OTHER_FORMS = {
     ".gpx": "GPX",
@@ -150,9 +151,14 @@ def _read_logged(path: Path) -> GnssFixes:
     fixed = _have_a_fix(table)
     if not fixed.all():
         notes.append(f"{path}: {int((~fixed).sum())} rows say that there is no fix")
-    return checked_fixes(
-        times_ns[fixed], position[fixed], _covariance_in(table)[fixed], str(path), tuple(notes)
-    )
+    covariance = _covariance_in(table)[fixed]
+    unread = [name for name in table.header[1:] if _ACCURACY.search(name)]
+    if unread and np.isnan(covariance).all():
+        notes.append(
+            f"{path}: {', '.join(unread)}: accuracies beside other columns are not read; write {_FORM} "
+            "where they count"
+        )
+    return checked_fixes(times_ns[fixed], position[fixed], covariance, str(path), tuple(notes))
 
 
 def _unit(name: str, is_height: bool) -> float:
