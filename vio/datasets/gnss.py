@@ -51,7 +51,7 @@ _LENGTHS_M = tuple(
 _HEMISPHERE = re.compile(r"\bn ?/ ?s\b|\be ?/ ?w\b|hemi|(?:lat|lon|lng)[a-z]*[ _.]?(?:dir|ref)")
 _STATUS = re.compile(r"(?:^|[^a-z])status[./]status$")
 _COVARIANCE = re.compile(r"position_covariance[^a-z]*\d\]?$")
-_ACCURACY = re.compile(r"sigma|std|accuracy|covariance(?!_type)|^[hv]_?acc")  # in any form
+_ACCURACY = re.compile(r"sigma|std|accuracy|^[hv]_?acc")  # in any form
 _COVARIANCE_KIND = re.compile(r"position_covariance_type$")
 _OTHER_FORMS = {
     ".gpx": "GPX",
