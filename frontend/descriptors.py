@@ -1,8 +1,8 @@
 """Front ends that detect key points in every left image, and follow features by matching their
 descriptors.
 
-What was not detected again is followed to where the camera's motion takes it; anchors, right
-matches and checks are those of `vio.frontend.tracking`.
+What was not detected again is looked for where it is predicted, then where the camera's motion
+takes it; anchors, right matches and checks are those of `vio.frontend.tracking`.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class KeypointFlow:
         expected: FloatArray,
     ) -> tuple[FloatArray, BoolArray]:
         """Return the pixels (N, 2) of the previous frame's features in the left image, and a mask
-        (N,) of those whose key point was detected again.
+        (N,) of those found: at a key point, else where they were predicted.
         """
         old = previous.tracks
         points = self._seen
@@ -117,7 +117,22 @@ class KeypointFlow:
         good = (score >= MIN_CORRELATION) & on_peak(pixels, start)
         found[rows] = np.where(good[:, None], pixels, start)
         seen[rows] = True
+        lost = (~seen).nonzero()[0]
+        found[lost], seen[lost] = self._where_expected(old, lost, guess, image.full)
         return found, seen
+
+    def _where_expected(
+        self, old: Tracks, rows: IntArray, guess: FloatArray, image: Image
+    ) -> tuple[FloatArray, BoolArray]:
+        """Return the pixels (K, 2) of features in rows (K,) whose key point was not detected again,
+        and a mask (K,) of those that look like their anchors at the predicted pixels.
+        """
+        start = guess[rows]
+        warp = old.warp[rows]
+        warp[:, :, 2] = start
+        warp, score = align(self._bank.store, old.slot[rows], image, warp, _REFINEMENTS)
+        pixels = warp[:, :, 2]
+        return pixels, (score >= MIN_CORRELATION) & on_peak(pixels, start)
 
     def keep(self, tracks: Tracks) -> None:
         """Remember the descriptors of the key points where a frame's features are.
