@@ -44,13 +44,23 @@ _UNPICKLED = (
 
 
 def begins_as_npy(path: Path) -> bool:
-    """Return whether a file begins as one array of NumPy's, `.npy`."""
+    """Return whether a file begins as one array of NumPy's, `.npy`.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe or a device.
+    """
+    check_regular(path)
     with path.open("rb") as stream:
         return stream.read(len(_NPY)) == _NPY
 
 
 def is_pickled_dictionary(path: Path) -> bool:
-    """Return whether a file is an `.npy` with one object, as `numpy.save` writes a dictionary."""
+    """Return whether a file is an `.npy` with one object, as `numpy.save` writes a dictionary.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe or a device.
+    """
+    check_regular(path)
     with path.open("rb") as stream:
         try:
             return _npy_header(stream) == ((), np.dtype(object))
