@@ -281,7 +281,7 @@ def test_refusals_are_one_line(
         ([str(moved)], "name the recording with --source"),
         ([str(run_folder), "--voxel", "0"], "--voxel takes 0.001 to 100 m"),
         ([str(run_folder), "--memory", "1"], "--memory takes 16"),
-        ([str(tmp_path)], "no run folder"),
+        ([str(tmp_path)], "holds the results of runs; give one of them"),
         ([str(run_folder), "--map", str(tmp_path / "none.map")], "there is no such map"),
     ):
         assert message in refused(capsys, "mesh", *arguments)

@@ -146,10 +146,16 @@ class SwayingCamera:
         camera has them.
         """
         x, *_ = self.motion(time_ns * 1e-9)
+        # without noise, what it sways back to would be the same exposure again
+        rng = np.random.default_rng(abs(time_ns))
         right = None
         if self._camera.kind == "stereo":
-            right = self._image(x + self._camera.baseline_m)
-        return self._image(x), right, self._depth_m if self._camera.kind == "rgbd" else None
+            right = _with_noise(self._image(x + self._camera.baseline_m), rng)
+        return (
+            _with_noise(self._image(x), rng),
+            right,
+            self._depth_m if self._camera.kind == "rgbd" else None,
+        )
 
     def motion(self, time_s: float) -> tuple[float, float, float]:
         """Return position, speed and acceleration along the camera's x axis, m and s; at rest
@@ -180,6 +186,13 @@ class SwayingCamera:
             size = self._size[0], rows.stop - rows.start
             out[rows] = cv2.warpAffine(self._texture[rows], shift, size, flags=cv2.INTER_LINEAR)
         return out
+
+
+def _with_noise(image: Image, rng: np.random.Generator) -> Image:
+    """Return an image (H, W) with noise of a gray level."""
+    import cv2
+
+    return np.asarray(cv2.add(image, rng.integers(0, 3, image.shape, dtype=np.uint8)), np.uint8)
 
 
 @contextlib.contextmanager
