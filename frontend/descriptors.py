@@ -15,7 +15,6 @@ from vio.frontend.align import MIN_CORRELATION, align, on_peak
 from vio.frontend.columns import take
 from vio.frontend.keypoints import Descriptors, Extractor, Keypoints, Matcher
 from vio.frontend.patches import ImageLevels, inside
-from vio.frontend.prediction import guessed_pixels
 from vio.frontend.settings import FrontendSettings
 from vio.frontend.tracking import TrackingFrontend
 from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks
@@ -23,7 +22,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Tolerance
-from vio.records import BoolArray, Image, IntArray, TrackPrior
+from vio.records import BoolArray, Image, IntArray
 
 
 class _MatchRules(NamedTuple):
@@ -54,7 +53,7 @@ class DescriptorFrontend(TrackingFrontend):
     ) -> None:
         """Prepare; the name is for messages."""
         bank = AnchorBank.for_features(settings.grid.target_features)
-        flow = KeypointFlow(camera, bank, extract, match)
+        flow = KeypointFlow(bank, extract, match)
         super().__init__(camera, settings, name, bank, flow, flow)
 
 
@@ -63,11 +62,8 @@ class KeypointFlow:
     see `vio.frontend.flow.Flow`.
     """
 
-    def __init__(
-        self, camera: StereoCamera, bank: AnchorBank, extract: Extractor, match: Matcher
-    ) -> None:
+    def __init__(self, bank: AnchorBank, extract: Extractor, match: Matcher) -> None:
         """Prepare; the bank contains the features' anchors."""
-        self._camera = camera
         self._bank = bank
         self._extract = extract
         self._match = match
@@ -88,14 +84,10 @@ class KeypointFlow:
         return self._seen.pixels
 
     def follow(
-        self,
-        previous: PreviousFrame,
-        image: ImageLevels,
-        prior: TrackPrior | None,
-        expected: FloatArray,
+        self, previous: PreviousFrame, image: ImageLevels, guess: FloatArray, *, trusted: bool
     ) -> tuple[FloatArray, BoolArray]:
-        """Return the pixels (N, 2) of the previous frame's features in the left image, and a mask
-        (N,) of those found: at a key point, else where they were predicted.
+        """Return pixels (N, 2) of features and a mask (N,) of those found, at a key point, else
+        where they are predicted; see `Flow`.
         """
         old = previous.tracks
         points = self._seen
@@ -103,31 +95,23 @@ class KeypointFlow:
         seen = np.zeros(len(old), dtype=np.bool_)
         if self._descriptors is None:
             return found, seen
-        guess = guessed_pixels(self._camera, old, prior, expected, image.full)
         near = _near_guess(guess, old.left, points.pixels, image.full.shape[1])
         pairs = self._match(Keypoints(old.left, self._descriptors[old.slot]), points, near)
         rows = pairs[:, 0]
-        described = pairs[:, 1]
-        slots = old.slot[rows]
-        start = points.pixels[described]
-        warp = old.warp[rows]
-        warp[:, :, 2] = start
-        warp, score = align(self._bank.store, slots, image.full, warp, _REFINEMENTS)
-        pixels = warp[:, :, 2]
-        good = (score >= MIN_CORRELATION) & on_peak(pixels, start)
+        start = points.pixels[pairs[:, 1]]
+        pixels, good = self._aligned(old, rows, start, image.full)
         found[rows] = np.where(good[:, None], pixels, start)
         seen[rows] = True
         lost = (~seen).nonzero()[0]
-        found[lost], seen[lost] = self._where_expected(old, lost, guess, image.full)
+        found[lost], seen[lost] = self._aligned(old, lost, guess[lost], image.full)
         return found, seen
 
-    def _where_expected(
-        self, old: Tracks, rows: IntArray, guess: FloatArray, image: Image
+    def _aligned(
+        self, old: Tracks, rows: IntArray, start: FloatArray, image: Image
     ) -> tuple[FloatArray, BoolArray]:
-        """Return the pixels (K, 2) of features in rows (K,) whose key point was not detected again,
-        and a mask (K,) of those that look like their anchors at the predicted pixels.
+        """Return the pixels (K, 2) of features in rows (K,) by their anchors, from pixels (K, 2)
+        on, and a mask (K,) of those that look like them there.
         """
-        start = guess[rows]
         warp = old.warp[rows]
         warp[:, :, 2] = start
         warp, score = align(self._bank.store, old.slot[rows], image, warp, _REFINEMENTS)

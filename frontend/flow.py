@@ -11,13 +11,11 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.frontend.patches import ImageLevels, inside, mean_and_contrast
-from vio.frontend.prediction import guessed_pixels
 from vio.frontend.tracks import ANCHOR_REACH_PX, PreviousFrame, Tracks
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Capacity, Tolerance
-from vio.records import BoolArray, Image, TrackPrior
+from vio.records import BoolArray, Image
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +61,7 @@ class Flow(Protocol):
         """
 
     def follow(
-        self,
-        previous: PreviousFrame,
-        image: ImageLevels,
-        prior: TrackPrior | None,
-        expected: FloatArray,
+        self, previous: PreviousFrame, image: ImageLevels, guess: FloatArray, *, trusted: bool
     ) -> tuple[FloatArray, BoolArray]:
         """Return the pixels (N, 2) of the previous frame's features in the left image, and a mask
         (N,) of those found.
@@ -75,8 +69,8 @@ class Flow(Protocol):
         Args:
             previous: the previous frame, N features.
             image: the current left image.
-            prior: usable prior, or None.
-            expected: motion (4, 4) `T_curr_prev` by the last one.
+            guess: predicted pixels (N, 2) in it.
+            trusted: whether the guess comes from a prior or from a motion with consensus.
         """
 
     def keep(self, tracks: Tracks) -> None:
@@ -86,9 +80,8 @@ class Flow(Protocol):
 class LucasKanade:
     """Follows features by forward-backward Lucas-Kanade."""
 
-    def __init__(self, camera: StereoCamera, levels: int) -> None:
+    def __init__(self, levels: int) -> None:
         """Prepare, with the pyramid levels above half resolution."""
-        self._camera = camera
         self._levels = levels
 
     def see(self, image: Image) -> bool:
@@ -96,17 +89,12 @@ class LucasKanade:
         return False
 
     def follow(
-        self,
-        previous: PreviousFrame,
-        image: ImageLevels,
-        prior: TrackPrior | None,
-        expected: FloatArray,
+        self, previous: PreviousFrame, image: ImageLevels, guess: FloatArray, *, trusted: bool
     ) -> tuple[FloatArray, BoolArray]:
         """Return pixels (N, 2) of features and a mask (N,) of those found; see `Flow`."""
-        old = previous.tracks
-        guess = guessed_pixels(self._camera, old, prior, expected, image.full)
-        trusted = prior is not None or previous.trusted
-        return track_with_retries(previous.left.half, image, old.left, guess, trusted, self._levels)
+        last = previous.left.half
+        left = previous.tracks.left
+        return track_with_retries(last, image, left, guess, trusted, self._levels)
 
     def keep(self, tracks: Tracks) -> None:
         """Nothing is kept of features."""

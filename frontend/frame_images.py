@@ -1,5 +1,5 @@
-"""The images of a frame as front ends use them that follow features: checked, equalised, paired by time, at
-two resolutions.
+"""The images of a frame as front ends use them that follow features: checked, equalised, paired by
+time, at two resolutions.
 """
 
 from __future__ import annotations

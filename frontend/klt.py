@@ -22,5 +22,5 @@ class KltFrontend(TrackingFrontend):
         """Prepare; a `detector` finds the corners in place of the built-in one."""
         settings = FrontendSettings() if settings is None else settings
         bank = AnchorBank.for_features(settings.grid.target_features)
-        flow = LucasKanade(camera, settings.klt.pyramid_levels)
+        flow = LucasKanade(settings.klt.pyramid_levels)
         super().__init__(camera, settings, "klt", bank, flow, detector)

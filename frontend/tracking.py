@@ -16,6 +16,7 @@ from vio.frontend.frame_images import FrameImages, ImagePreparation
 from vio.frontend.frames import Stopwatch, make_output, usable_prior
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.outliers import Consensus, RansacProblem
+from vio.frontend.prediction import guessed_pixels
 from vio.frontend.reappearance import is_long_gap, motion_after_gap
 from vio.frontend.right_alone import RightFollower
 from vio.frontend.right_match import RightMatcher
@@ -153,7 +154,9 @@ class TrackingFrontend:
                 prior = None
             elif prior is None:
                 return no_tracks(), None
-        found, seen = self._flow.follow(previous, left, prior, expected)
+        guess = guessed_pixels(self._camera, old, prior, expected, left.full)
+        trusted = prior is not None or previous.trusted
+        found, seen = self._flow.follow(previous, left, guess, trusted=trusted)
         watch.lap("track")
         problem = self._problem(frame.index, INLIER_PX)
         seen, motion, slow = self._static.select(problem, old, found, seen, prior, expected, images)

@@ -1,4 +1,6 @@
-"""Key points are spread over the image; features are followed where theirs are not detected again."""
+"""Key points are spread over the image; features are followed where theirs are not detected
+again.
+"""
 
 from __future__ import annotations
 

@@ -469,7 +469,7 @@ def _follows(moved_px: float) -> bool:
 def _is_used(row: float) -> bool:
     """Whether a key point in such a row is used."""
     points = [Keypoints(np.array([[160.0, row]]), np.zeros((1, 32), np.uint8))]
-    flow = KeypointFlow(CAMERA, AnchorBank(1, 9), lambda *_: points, MutualNearest())
+    flow = KeypointFlow(AnchorBank(1, 9), lambda *_: points, MutualNearest())
     image = _blobs().clip(0, 255).astype(np.uint8)
     flow.see(image)
     return len(flow.detect(image)) == 1
