@@ -293,7 +293,7 @@ def detect_corners(
     # Ties are ordered by cell, then row by row, so that equal images give equal corners.
     place = (cell * height + corners[:, 1]) * width + corners[:, 0]
     rows = rows[np.lexsort((place[rows], -strength[rows]))]
-    level = _filling(
+    level = filling(
         cell[rows], cell_index(occupied, 2 * width, 2 * height, shape), shape[0] * shape[1]
     )
     order = level.argsort(kind="stable")
@@ -338,7 +338,7 @@ def _candidates(
     return weaker[best_first[:missing]]
 
 
-def _filling(cell: IntArray, occupied: IntArray, cells: int) -> IntArray:
+def filling(cell: IntArray, occupied: IntArray, cells: int) -> IntArray:
     """Number (N,) of features in the cell of each point before it is added, if points are added in
     their order.
 
@@ -357,53 +357,10 @@ def _filling(cell: IntArray, occupied: IntArray, cells: int) -> IntArray:
 
 @compiled
 def _fill(cell: IntArray, held: IntArray, filled: IntArray) -> None:
-    """Write the numbers (N,) of `_filling`; those of features in the cells (C,) are counted up."""
+    """Write the numbers (N,) of `filling`; those of features in the cells (C,) are counted up."""
     for n in range(len(cell)):
         filled[n] = held[cell[n]]
         held[cell[n]] += 1
-
-
-def spread_evenly(
-    points: FloatArray, occupied: FloatArray, size: tuple[int, int], grid: GridSettings
-) -> IntArray:
-    """Select rows of points (N, 2), strongest first, that fill the grid evenly together with
-    `occupied` (M, 2).
-
-    The total is at most `target_features`; no point is closer than the minimum distance to another
-    or to an occupied one; the emptiest cells are filled first. `size` is the image's width and
-    height.
-    """
-    width, height = size
-    wanted = grid.target_features - len(occupied)
-    if wanted <= 0 or len(points) == 0:
-        return np.zeros(0, dtype=np.int64)
-    distance = min_distance_px(width, height, grid)
-    near = np.empty(len(points), dtype=np.bool_)
-    _near_others(points, occupied, distance, near)
-    candidates = (~near).nonzero()[0]
-    shape = grid_shape(width, height, grid)
-    cell, held = (cell_index(uv, width, height, shape) for uv in (points[candidates], occupied))
-    level = _filling(cell, held, shape[0] * shape[1])
-    return candidates[level.argsort(kind="stable")[:wanted]]
-
-
-@compiled
-def _near_others(
-    points: FloatArray, occupied: FloatArray, distance: float, near: BoolArray
-) -> None:
-    """Write which points (N, 2) have an occupied (M, 2), or a stronger one of them, in the
-    square around them.
-    """
-    for i in range(len(points)):
-        near[i] = False
-        for others, count in ((occupied, len(occupied)), (points, i)):
-            for j in range(count):
-                if (
-                    abs(points[i, 0] - others[j, 0]) < distance
-                    and abs(points[i, 1] - others[j, 1]) < distance
-                ):
-                    near[i] = True
-                    break
 
 
 def load_mask(path: Path) -> Image:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.frontend.detect import filling
 from vio.frontend.settings import MatchSettings
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled, compiled_sums
@@ -218,10 +219,10 @@ def spread_rows(
     height, width = shape
     side = math.sqrt(_SPREAD.in_cell * height * width / count)
     column, row = (pixels // side).astype(np.int64).T
-    cell = row * (1 + int(width / side)) + column
+    columns = 1 + int(width / side)
+    cell = row * columns + column
     order = np.lexsort((pixels[:, 1], pixels[:, 0], -strength, cell))
-    begins = np.flatnonzero(np.diff(cell[order], prepend=-1))
-    rank = np.arange(len(order)) - np.repeat(begins, np.diff(begins, append=len(order)))
+    rank = filling(cell[order], cell[:0], columns * (1 + int(height / side)))
     return order[np.lexsort((-strength[order], rank))[:count]]
 
 

@@ -37,7 +37,7 @@ _CODE = "right-contradicts-left"
 _UNKNOWN_CODE = "right-matches-missing"
 
 
-def most_contradict(matched: BoolArray) -> bool:
+def _most_contradict(matched: BoolArray) -> bool:
     """Whether so few of the points (K,) of known depth are in the right image where they should be
     that it is not a matter of single matches.
     """
@@ -139,7 +139,7 @@ class RightCamera(Finder):
                 and share >= _CONTRADICTION.agreeing_share
             )
             self._count_agreement(index, tested=tested, agrees=agrees)
-        elif moved and most_contradict(matched):
+        elif moved and _most_contradict(matched):
             self._begin(index)
         else:
             self._agreed += tested and share >= _CONTRADICTION.agreeing_share

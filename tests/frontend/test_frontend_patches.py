@@ -21,7 +21,6 @@ from vio.frontend.detect import (
     local_maxima,
     min_distance_px,
     noise_gradient,
-    spread_evenly,
 )
 from vio.frontend.patches import ImageLevels, half_image, inside
 from vio.frontend.prediction import moved_pixels, prior_pixels
@@ -607,35 +606,6 @@ def test_prior_pixels_are_matched_by_id() -> None:
         0: [8.0, 9.0],
         2: [0.0, 1.0],
     }
-
-
-def test_spread_evenly_equals_a_greedy_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(12)
-    points, occupied = (
-        rng.uniform([0, 0], [400, 300], (120, 2)),
-        rng.uniform([0, 0], [400, 300], (10, 2)),
-    )
-    monkeypatch.setattr(detect, "_CORNERS", detect._CORNERS._replace(cell_features=3))
-    monkeypatch.setattr(detect, "_CORNERS", detect._CORNERS._replace(min_distance_share=0.0))
-    grid = GridSettings(target_features=60)
-    rows = spread_evenly(points, occupied, (400, 300), grid)
-    shape = grid_shape(400, 300, grid)
-    cell = cell_index(points, 400, 300, shape)
-    held = np.bincount(cell_index(occupied, 400, 300, shape), minlength=shape[0] * shape[1])
-    apart, taken = min_distance_px(400, 300, grid), list(occupied)
-    far = [
-        p
-        for p in range(120)
-        if np.abs(np.concatenate([points[:p], taken]) - points[p]).max(axis=1).min() >= apart
-    ]
-    expected: list[int] = []
-    while len(expected) < 50 and far:
-        best = min(far, key=lambda p: (held[cell[p]], p))
-        far.remove(best)
-        held[cell[best]] += 1
-        expected.append(best)
-    assert len(expected) == 50
-    assert rows.tolist() == expected
 
 
 @pytest.mark.parametrize("count", [4, 12, 100])
