@@ -1,11 +1,15 @@
-"""What tells an exposure from any other one."""
+"""What tells an exposure from any other one, and whether one comes again."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from hashlib import blake2b
 
+from vio.numerics.kinds import Capacity
 from vio.records import Image
+
+_FRAMES: Capacity[int] = 16  # that are remembered, as many as a ring of buffers may have
 
 
 def exposure_digest(images: Sequence[Image]) -> bytes:
@@ -18,3 +22,25 @@ def exposure_digest(images: Sequence[Image]) -> bytes:
     for image in images:
         digest.update(image.tobytes())
     return digest.digest()
+
+
+class EarlierExposures:
+    """The exposures of some frames ago, which a ring of buffers that is read at the wrong place
+    gives again.
+    """
+
+    def __init__(self) -> None:
+        self._ring = deque[tuple[int, bytes]](maxlen=_FRAMES)
+
+    def add(self, index: int, digest: bytes) -> None:
+        """Take the newest exposure, of a frame of that number."""
+        self._ring.append((index, digest))
+
+    def find(self, digest: bytes) -> int | None:
+        """Return the number of the frame before the newest one that has a digest; None: there is
+        none, or nothing tells it from others.
+        """
+        if not digest:
+            return None
+        earlier = list(self._ring)[:-1]
+        return next((index for index, shown in earlier if shown == digest), None)

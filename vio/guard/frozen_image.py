@@ -2,13 +2,12 @@
 
 An image that stays the same, up to noise, while the other camera's changes is frozen. A left one
 has changed just before, too: at a standstill it stays the same, and what covers the right one
-changes that. One that is that of some frames ago, to the last bit, comes from a ring of buffers that
-was read at the wrong place.
+changes that. One that is that of some frames ago, to the last bit, comes from a ring of buffers
+that was read at the wrong place.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.findings import begun, ended
 from vio.frontend.patches import mean_and_contrast
-from vio.guard.exposure import exposure_digest
+from vio.guard.exposure import EarlierExposures, exposure_digest
 from vio.guard.image_change import image_change
 from vio.guard.image_check import FrameImages, ImageCheck
 from vio.numerics.kinds import Capacity
@@ -40,7 +39,6 @@ class _FrozenRules:
     # how fast the usual ratio of the two changes is learned, which depends on gains and scene
     ratio_gain: float = 0.1
     frames: int = 3  # in a row before it is reported
-    ring_frames: Capacity[int] = 16  # earlier images of each camera that are remembered
     dark_share: float = 0.1  # contrast of a dark or covered image over that of the other one
 
 
@@ -69,8 +67,8 @@ class FrozenCamera(ImageCheck):
     def __init__(self) -> None:
         super().__init__()
         self._last: _SparseImages | None = None  # the last frame in which no image was frozen
-        # of the images of each camera in such frames
-        self._rings = tuple(deque[bytes](maxlen=_FROZEN.ring_frames) for _ in range(2))
+        # of each camera, in such frames
+        self._earlier = EarlierExposures(), EarlierExposures()
         self._ratio = 1.0  # usual change of the right image over that of the left one
         # change of the left image in the last frame in which no image was frozen
         self._moved_left = 0.0
@@ -108,7 +106,10 @@ class FrozenCamera(ImageCheck):
         if last is None:
             self._keep(now, digests)
             return False
-        left_again, right_again = self._come_again(digests)
+        left_again, right_again = (
+            earlier.find(digest) is not None
+            for earlier, digest in zip(self._earlier, digests, strict=True)
+        )
         equal = np.array_equal(now.left, last.left) and not np.array_equal(now.right, last.right)
         if equal or (left_again and not right_again):
             self._count_left(last.index, index)
@@ -142,18 +143,8 @@ class FrozenCamera(ImageCheck):
     def _keep(self, now: _SparseImages, digests: tuple[bytes, bytes]) -> None:
         """Remember a frame in which no image is frozen, with the digests of its images."""
         self._last = now
-        for ring, digest in zip(self._rings, digests, strict=True):
-            ring.append(digest)
-
-    def _come_again(self, digests: tuple[bytes, bytes]) -> tuple[bool, bool]:
-        """Return whether the left and the right image are those of a frame before the last one, by
-        their digests.
-        """
-        left, right = (
-            bool(digest) and digest in list(ring)[:-1]
-            for ring, digest in zip(self._rings, digests, strict=True)
-        )
-        return left, right
+        for earlier, digest in zip(self._earlier, digests, strict=True):
+            earlier.add(now.index, digest)
 
     def _distrust(self, cause: Cause, since: int, index: int) -> None:
         """Count a frame whose right image is not used; one cause that lasts is reported once."""

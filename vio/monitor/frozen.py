@@ -3,8 +3,8 @@ them again.
 
 Equal to the last bit is the same exposure, as noise differs from one to the next, unless images
 without noise, of a simulator, show a rig at standstill: what moved up to the frame before has not
-stopped at once. A ring of buffers that is read at the wrong place gives an earlier exposure than the
-last one again. By images alone, a rig that crept and did not slow down may have: the first such
+stopped at once. A ring of buffers that is read at the wrong place gives an earlier exposure than
+the last one again. By images alone, a rig that crept and did not slow down may have: the first such
 frames are left out, and nothing is said of them. Nearly equal
 pairs (encoded again, or with noise on top) are the same where the tracked corners have not moved,
 while the motion predicted since the last frame moves them by more than its uncertainty allows and
@@ -24,7 +24,7 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, lengths, se3_log
-from vio.guard.exposure import exposure_digest
+from vio.guard.exposure import EarlierExposures, exposure_digest
 from vio.imu.standstill import STANDSTILL_S, blocks_agree
 from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Capacity
@@ -64,9 +64,7 @@ class _FlowRules(NamedTuple):
     unmoved_px: float = 0.15  # the flow of an unmoved corner under noise of a few gray levels
     unmoved_share: float = 0.8  # of the corners that must be unmoved
     first_rows: Capacity[int] = 8  # compared before all others
-    # Earlier frames of a ring of buffers, and which of their rows are remembered.
-    ring_frames: Capacity[int] = 16
-    ring_stride_px: Capacity[int] = 32
+    ring_stride_px: Capacity[int] = 32  # of the rows that tell earlier frames
     # The newest, at most and at least, of which so many have not moved, each between two that have …
     twice_frames: int = 12
     min_twice_frames: int = 8
@@ -145,8 +143,7 @@ class FrozenImages:
     def __init__(self) -> None:
         self._imu: list[ImuSample] = []  # the last half second
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
-        # numbers of the last frames that are none, and some of their rows
-        self._ring = deque[tuple[int, bytes]](maxlen=_FLOW.ring_frames)
+        self._earlier = EarlierExposures()  # of the last frames that are none, by some rows
         self._seen: Observations | None = None  # its features
         # median flow of them, and of those of the frame before; None: too few were seen twice
         self._flow_px: float | None = None
@@ -210,7 +207,7 @@ class FrozenImages:
         self._expected = expected
         if self._repeating is None:
             self._shown = frame
-            self._ring.append((frame.index, rows))
+            self._earlier.add(frame.index, rows)
         else:
             self._flows.append(_Flow(frame.index, 0.0, None))
         return self._repeating
@@ -274,10 +271,10 @@ class FrozenImages:
 
     def _older(self, rows: bytes, expected: Prediction | None) -> Repeated | None:
         """Return which frame before the last one shows the same rows, while the rig moves."""
-        for index, shown in list(self._ring)[:-1]:
-            if rows and rows == shown and self._moves(expected):
-                return Repeated(index, True, older=True)
-        return None
+        index = self._earlier.find(rows)
+        if index is None or not self._moves(expected):
+            return None
+        return Repeated(index, True, older=True)
 
     def _judge_equal(
         self, frame: StereoFrame, shown: StereoFrame, expected: Prediction | None
