@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from functools import partial
 from itertools import combinations
 
 # what may differ between the names of a pair, left first; in small letters, numbers as numbers
@@ -87,7 +88,9 @@ def split_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
 def _in_pairs(
     frames: dict[tuple[str, ...], dict[str, str]], count: int
 ) -> tuple[list[str], list[str]] | None:
-    """Return the left and the right names of the frames that have both; None: they are few of all."""
+    """Return the left and the right names of the frames that have both; None: they are few of
+    all.
+    """
     pairs = [sides for sides in frames.values() if len(sides) == 2]
     alone = count - 2 * len(pairs)
     if not pairs or alone > len(pairs):
@@ -96,8 +99,8 @@ def _in_pairs(
 
 
 def stamped_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
-    """Return the names of left and right images that lie in one folder, where each has a word for its
-    side and a time or number of its own (`front_left_0_1600000000250000000`); None: some have
+    """Return the names of left and right images that lie in one folder, where each has a word for
+    its side and a time or number of its own (`front_left_0_1600000000250000000`); None: some have
     none, one side has less than half of the other, or one begins when the other has ended, as turns
     to the left and to the right of one camera do.
     """
@@ -119,8 +122,8 @@ def stamped_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
 
 
 def frame_words(stem: str) -> tuple[str, ...] | str:
-    """Return the words of an image's name without the side that one of them states, also as a part of
-    it (`000003_leftImg8bit`); the name where none does.
+    """Return the words of an image's name without the side that one of them states, also as a part
+    of it (`000003_leftImg8bit`); the name where none does.
     """
     found = _frame_and_side(stem, ())
     return stem if found is None else found[0]
@@ -137,14 +140,11 @@ def _frame_and_side(name: str, numbers: tuple[str, ...]) -> tuple[tuple[str, ...
         numbers: of the left and the right camera; none: words alone tell.
     """
     words = words_of(os.path.splitext(name)[0])
-    for k in range(len(words)):
-        side = _side_of_word(words, k)
-        if side is not None:
-            return (*words[:k], "", *words[k + 1 :]), side
-    for k in range(len(words)):
-        side = _side_of_camera(words, k, numbers)
-        if side is not None:
-            return (*words[:k], "", *words[k + 1 :]), side
+    for side_at in (_side_of_word, partial(_side_of_camera, numbers=numbers)):
+        for k in range(len(words)):
+            side = side_at(words, k)
+            if side is not None:
+                return (*words[:k], "", *words[k + 1 :]), side
     return None
 
 

@@ -4,8 +4,8 @@ A stream that negotiates another size, a driver that bins pixels, or a zoom lens
 calibration holds. Points of known depth then move by a share of their distance from the principal
 point, or all by the same pixels, which no motion of a rig explains. Both are fitted, beside the
 motion, where features lie far from where they were predicted. Where few features or a flat scene
-leave the fit of both unknown, a shift alone or a scale alone decides that explains the pixels as well.
-A change that explains them no better than the motion alone is none.
+leave the fit of both unknown, a shift alone or a scale alone decides that explains the pixels as
+well. A change that explains them no better than the motion alone is none.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class _GeometryRules(NamedTuple):
     share_uncertain: float = 0.3
     min_growth: float = 0.005
     min_shift_px: float = 3.0
-    # variance of the pixels by a simple change, over that by a free one, up to which it explains them
-    # as well; likewise by none at all, over that by a change, which then is none
+    # variance of the pixels by a simple change, over that by a free one, up to which it explains
+    # them as well; likewise by none at all, over that by a change, which then is none
     as_well: float = 1.3
     # how far all disparities may be off: by as much, times the way over the baseline, so may pixels
     disparity_px: float = 1.0
@@ -57,7 +57,8 @@ _RULES = _GeometryRules()
 _CODE = "image-geometry-changed"
 _MIN_DEPTH_M: Tolerance[float] = 0.05
 _NONE = np.array([1.0, 1.0, 0.0, 0.0])
-# What may change (4, K), of `_Change.value`: all of it, the shifts, or one scale of columns and rows.
+# What may change (4, K), of `_Change.value`: all of it, the shifts, or one scale of columns and
+# rows.
 _FREE = np.eye(4)
 _NOTHING = _FREE[:, :0]
 _SIMPLE = _FREE[:, 2:], np.array([[1.0], [1.0], [0.0], [0.0]])
@@ -148,9 +149,6 @@ class ImageGeometry:
         free = _fitted(self._camera, *points)
         if free is None:
             return None
-        still = _fitted(self._camera, *points, _NOTHING)
-        if still is None:
-            return None
         candidates = [(free, _FREE)]
         if not free.known.all():
             simple = [(_fitted(self._camera, *points, kind), kind) for kind in _SIMPLE]
@@ -158,8 +156,12 @@ class ImageGeometry:
             candidates += [
                 (c, kind) for c, kind in simple if c is not None and c.variance < as_well
             ]
-        for change, kind in candidates:
-            if not change.is_clear or _RULES.as_well * change.variance > still.variance:
+        clear = [(change, kind) for change, kind in candidates if change.is_clear]
+        still = _fitted(self._camera, *points, _NOTHING) if clear else None
+        if still is None:
+            return None
+        for change, kind in clear:
+            if _RULES.as_well * change.variance > still.variance:
                 continue
             usual = _between(self._camera, first, before, kind)
             if usual is None:
