@@ -182,8 +182,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _place(word: str, words: Sequence[str], options: Iterable[str]) -> str:
-    """Return a hint at where a word of a command line that is too much belongs; nothing where that is
-    not clear.
+    """Return a hint at where a word of a command line that is too much belongs; nothing where that
+    is not clear.
     """
     names = list(options)
     if "=" in word:

@@ -169,8 +169,8 @@ def _unit(name: str, is_height: bool) -> float:
 
 
 def _places_in(header: Sequence[str]) -> tuple[int, int, int | None] | None:
-    """Return which columns behind the stamp are latitude, longitude and height (None: there is none);
-    None: no header names both of the former, or several columns do.
+    """Return which columns behind the stamp are latitude, longitude and height (None: there is
+    none); None: no header names both of the former, or several columns do.
     """
     found = [
         [

@@ -67,8 +67,8 @@ def read_imu_lines(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
 
 def read_frame_times(path: Path) -> IntArray:
     """Read the times (F,) of the frames of Spectacular AI's `data.jsonl`, whose lines
-    `{"frames": [{"cameraInd": 0, "time": s}, ...], "time": s}` are in the order of its videos; that of
-    the first camera where it has its own.
+    `{"frames": [{"cameraInd": 0, "time": s}, ...], "time": s}` are in the order of its videos; that
+    of the first camera where it has its own.
 
     Raises:
         DataError: a line is no JSON, or the times do not increase.

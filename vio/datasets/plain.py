@@ -205,8 +205,8 @@ def _pair_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
 
 
 def _only_folder(path: Path) -> Layout | None:
-    """Return the layout of the one folder below a folder that holds images, whatever its name; None:
-    there are none, or several.
+    """Return the layout of the one folder below a folder that holds images, whatever its name;
+    None: there are none, or several.
     """
     found = list(image_folders(path))
     if len(found) != 1:

@@ -571,8 +571,8 @@ def _imu_table(path: Path, cut: list[str] | None) -> NumberTable:
 
 
 def read_logged_table(path: Path, form: str, cut: list[str] | None = None) -> NumberTable:
-    """Read all columns of a table of messages or of a logger, with the time that its header names in
-    front; see `read_table`.
+    """Read all columns of a table of messages or of a logger, with the time that its header names
+    in front; see `read_table`.
     """
     table = read_table(path, column_count(path), form, cut)
     timed = _time_first(table)

@@ -166,7 +166,8 @@ def _check_side_by_side(rig: Rig, video: _Facts, path: Path, calibration: Path) 
 
 def _own_lists(path: Path, files: tuple[Path, Path]) -> tuple[Path, Path] | None:
     """Return the list of times of each of two videos, beside it and named as it (`left.txt`,
-    `left_timestamps.csv`), or in a folder of its own (`left/timestamps.txt`); None: there are not both.
+    `left_timestamps.csv`), or in a folder of its own (`left/timestamps.txt`); None: there are not
+    both.
     """
     found = []
     for video in files:

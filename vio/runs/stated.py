@@ -253,8 +253,8 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
 
 
 def _no_run(path: Path) -> str:
-    """Say that a path is no run's folder, and which may be meant: the one that a file lies in, one in
-    the folder, or one of a name like it.
+    """Say that a path is no run's folder, and which may be meant: the one that a file lies in, one
+    in the folder, or one of a name like it.
     """
     wanted = "give a folder that `vio run` wrote"
     if not path.exists():
@@ -272,7 +272,9 @@ def _no_run(path: Path) -> str:
 
 
 def _runs_in(folder: Path) -> list[Path]:
-    """Return the folders of runs in a folder, by name; none: it is no folder, or cannot be listed."""
+    """Return the folders of runs in a folder, by name; none: it is no folder, or cannot be
+    listed.
+    """
     try:
         return sorted(run.parent for run in folder.glob(f"*/{RunFile.METRICS}"))
     except OSError:
