@@ -41,6 +41,10 @@ class _ExchangeRules:
     # share of them above which a frame that looks exchanged is refused: its rows do not fit when
     # put back
     refused_share: float = 0.2
+    # Change of the images from their own last ones, over that from the other camera's, below which
+    # they are in order: exchanged ones differ by motion minus disparity and motion plus disparity
+    # from their own, which together is no less than twice the motion.
+    least_own_change: float = 0.5
 
 
 _EXCHANGE = _ExchangeRules()
@@ -174,6 +178,8 @@ def _look_exchanged(now: tuple[Image, Image], last: tuple[Image, Image]) -> bool
     """Whether each image is rather like the other camera's last one."""
     own = [image_change(a, b) for a, b in zip(now, last, strict=True)]
     other = [image_change(a, b) for a, b in zip(now, last[::-1], strict=True)]
+    if sum(own) < _EXCHANGE.least_own_change * sum(other):
+        return False
     # The motion shifts both images alike; or it shifts them by less than the disparity does.
     unlike = abs(own[0] - own[1]) > abs(other[0] - other[1])
     return unlike or sum(own) > sum(other)
