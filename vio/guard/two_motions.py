@@ -15,10 +15,10 @@ import numpy as np
 
 from vio.dataclass import dataclass
 from vio.frontend.outliers import RansacProblem, best_motion, pixel_errors
-from vio.geometry.lie import FloatArray, length
+from vio.geometry.lie import FloatArray, length, lengths
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.numerics.kinds import Capacity
-from vio.numerics.robust import median
+from vio.numerics.robust import median, quantile
 from vio.records import IntArray, Observations, shared_rows
 
 
@@ -109,8 +109,8 @@ class TwoMotions:
             shared = self._shared(self._frames[-1 - span], seen)
             if len(shared.p) < _MOTIONS.min_features:
                 return None
-            moved_px = np.linalg.norm(shared.pixels - shared.before, axis=1)
-            if float(np.quantile(moved_px, 1.0 - _MOTIONS.moved_share)) >= _MOTIONS.moved_px:
+            moved_px = lengths(shared.pixels - shared.before)
+            if quantile(moved_px, 1.0 - _MOTIONS.moved_share) >= _MOTIONS.moved_px:
                 return self._second_motion(seen.frame_index, shared, moved_px)
         return None
 
