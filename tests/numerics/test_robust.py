@@ -7,6 +7,8 @@ import pytest
 
 from vio.numerics.robust import (
     cauchy_equations,
+    cauchy_fit,
+    fits_without_blocks,
     jackknife,
     median,
     quantile,
@@ -106,3 +108,18 @@ def test_cauchys_weights_are_no_narrower_than_stated() -> None:
     r[0] = 0.3
     J = np.ones((10, 1, 1))
     np.testing.assert_allclose(cauchy_equations(r, J, 0.3).vector[0], 0.3 / 2 + 9e-6, rtol=1e-6)
+
+
+def test_fits_without_blocks_are_those_to_the_other_values() -> None:
+    rng = np.random.default_rng(4)
+    terms = rng.normal(size=(60, 3))
+    values = terms @ [1.0, -2.0, 0.5] + 0.1 * rng.normal(size=60)
+    values[:5] += 3.0
+    block = rng.integers(3, 7, 60)
+    least = 0.2  # wider than the median, so that the widths are the same
+    whole = cauchy_fit(terms, values, np.zeros(3), least, 20)
+    found = fits_without_blocks(terms, values, whole, block, least, 20)
+    for coefficients, left_out in zip(found, np.unique(block), strict=True):
+        rest = block != left_out
+        expected = cauchy_fit(terms[rest], values[rest], whole, least, 20)
+        assert coefficients == pytest.approx(expected, abs=1e-7)

@@ -18,7 +18,7 @@ from vio.findings import Finding, begun
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.kinds import Tolerance
-from vio.numerics.robust import cauchy_fit, jackknife, median
+from vio.numerics.robust import cauchy_fit, fits_without_blocks, jackknife, median
 from vio.records import IntArray, Observations
 
 
@@ -122,11 +122,8 @@ class LensCheck:
         whole = cauchy_fit(terms, rows, start, least, _LENS.steps)
         sigmas = []
         for block in (_blocks(ids, _LENS.blocks), self._cells(z)):
-            without = [
-                cauchy_fit(terms[block != k], rows[block != k], whole, least, _LENS.further_steps)
-                for k in np.unique(block)
-            ]
-            sigmas.append(float(jackknife(np.array(without)[:, :2] @ self._squares)))
+            without = fits_without_blocks(terms, rows, whole, block, least, _LENS.further_steps)
+            sigmas.append(float(jackknife(without[:, :2] @ self._squares)))
         return float(self._squares @ whole[:2]), max(sigmas)
 
     def _cells(self, z: FloatArray) -> IntArray:

@@ -114,6 +114,41 @@ def cauchy_fit(
     return x
 
 
+def fits_without_blocks(
+    terms: FloatArray,
+    values: FloatArray,
+    whole: FloatArray,
+    block: npt.NDArray[np.int64],
+    least: float,
+    steps: int,
+) -> FloatArray:
+    """The coefficients (B, K) that `cauchy_fit` finds without one block of values, for each of B
+    blocks; the width of its weights is that of all values.
+
+    Args:
+        terms: (N, K).
+        values: (N,).
+        whole: those of all values (K,), to begin with.
+        block: the block (N,) that each value is in.
+        least: width of a residual, at least.
+        steps: number of them.
+    """
+    K = terms.shape[1]
+    of_block = np.unique(block)[:, None] == block
+    columns = np.column_stack([terms, values])
+    products = (terms[:, :, None] * columns[:, None, :]).reshape(len(values), -1)
+    width = max(median((values - terms @ whole) ** 2), least**2)
+    x = np.tile(whole, (len(of_block), 1))
+    for _ in range(steps):
+        weight = 1.0 / (1.0 + (values - x @ terms.T) ** 2 / width)
+        weight[of_block] = 0.0
+        sums = (weight @ products).reshape(-1, K, K + 1)
+        normal = sums[..., :K] + _RIDGE * np.eye(K)
+        gradient = sums[..., K:] - sums[..., :K] @ x[..., None]
+        x += np.linalg.solve(normal, gradient)[..., 0]
+    return x
+
+
 def jackknife(values: npt.ArrayLike) -> FloatArray:
     """Compute standard errors (...) of an estimate from its leave-one-block-out values (n, ...).
 
