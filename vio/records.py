@@ -19,6 +19,7 @@ from vio.errors import DataError
 from vio.findings import Finding, Integrity
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.compiled import compiled
 from vio.numerics.kinds import Tolerance
 
 NS_PER_S = 10**9
@@ -254,6 +255,11 @@ def shared_rows(ids: IntArray, other: IntArray) -> tuple[IntArray, IntArray]:
     """Return the rows (K,) of the features that two frames share, in the one and in the other, in
     the order of their ids; the ids (N,) and (M,) of a frame are unique.
     """
+    rows = np.empty(min(ids.size, other.size), dtype=np.int64)
+    others = np.empty_like(rows)
+    count = _meet(np.ascontiguousarray(ids), np.ascontiguousarray(other), rows, others)
+    if count >= 0:
+        return rows[:count], others[:count]
     rows = ids.argsort()
     others = other.argsort()
     place = other[others].searchsorted(ids[rows])
@@ -262,6 +268,32 @@ def shared_rows(ids: IntArray, other: IntArray) -> tuple[IntArray, IntArray]:
     others = others[place[inside]]
     same = ids[rows] == other[others]
     return rows[same], others[same]
+
+
+@compiled
+def _meet(ids: IntArray, other: IntArray, rows: IntArray, others: IntArray) -> int:
+    """Write where ids (N,) and (M,) that ascend are the same, and return how often; -1: they do
+    not ascend.
+    """
+    a = b = count = 0
+    while a < len(ids) and b < len(other):
+        if (a and ids[a] <= ids[a - 1]) or (b and other[b] <= other[b - 1]):
+            return -1
+        if ids[a] == other[b]:
+            rows[count] = a
+            others[count] = b
+            count += 1
+        # both go on where they are the same
+        step = ids[a] <= other[b]
+        b += other[b] <= ids[a]
+        a += step
+    for k in range(max(a, 1), len(ids)):
+        if ids[k] <= ids[k - 1]:
+            return -1
+    for k in range(max(b, 1), len(other)):
+        if other[k] <= other[k - 1]:
+            return -1
+    return count
 
 
 def observations(
