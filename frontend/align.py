@@ -20,7 +20,7 @@ import numpy.typing as npt
 from vio.dataclass import dataclass
 from vio.frontend.patches import Patches
 from vio.geometry.lie import FloatArray
-from vio.numerics.compiled import compiled, compiled_sums, invert_positive
+from vio.numerics.compiled import compiled, compiled_sums, dot, invert_positive
 from vio.numerics.kinds import Tolerance
 from vio.records import BoolArray, Image, IntArray
 
@@ -417,7 +417,7 @@ def _prepare(wide: Patches, of: Disc, slots: IntArray, out: _Columns, row_invers
             basis[7, k] = gv * y
         for i in range(_PARAMETERS):
             for j in range(i + 1):
-                normal[i, j] = _product(basis[i], basis[j])
+                normal[i, j] = dot(basis[i], basis[j])
             normal[i, i] += _DAMPING * normal[i, i] + 1e-6
         invert_positive(normal, out.inverse[slot])
         for i in range(_ROW_PARAMETERS):
@@ -435,14 +435,6 @@ def _weighted_mean(pixels: Pixels, at: IntArray, weights: Pixels) -> np.float32:
         total += weights[k] * pixels[at[k]]
         sum_of_weights += weights[k]
     return np.float32(total / sum_of_weights)
-
-
-@compiled_sums
-def _product(a: FloatArray, b: FloatArray) -> float:
-    total = 0.0
-    for k in range(len(a)):
-        total += a[k] * b[k]
-    return total
 
 
 def align(

@@ -18,7 +18,7 @@ from vio.frontend.align import Disc, Pixels, disc_of, warped_discs
 from vio.frontend.blurring import MAX_SPREAD_PX2
 from vio.frontend.tracks import AnchorBank
 from vio.geometry.lie import FloatArray
-from vio.numerics.compiled import compiled, invert_positive
+from vio.numerics.compiled import compiled, dot, invert_positive
 from vio.numerics.kinds import Tolerance
 from vio.records import Image, IntArray
 
@@ -209,7 +209,11 @@ def _add_features(
     shutter_s2, variance = known
     size = len(weights)
     side = patches.shape[1]
-    column = np.empty(5)
+    at = np.empty(size, np.int64)  # of the pixels in a patch, row by row
+    for k in range(size):
+        at[k] = (side // 2 + int(xy[1, k])) * side + side // 2 + int(xy[0, k])
+    columns = np.empty((5, size))
+    weighted = np.empty((5, size))
     normal = np.empty((4, 4))
     inverse = np.empty((4, 4))
     product = np.empty(4)
@@ -223,33 +227,31 @@ def _add_features(
         ):
             continue
         # The view is gain (patch + y (more along, less across) / 2 + m (more of both)) + offset.
-        patch = patches[n]
-        square = 0.0
-        for i in range(4):
-            product[i] = 0.0
-            for j in range(4):
-                normal[i, j] = 0.0
+        patch = patches[n].reshape(side * side)
         for k in range(size):
-            i = side // 2 + int(xy[1, k])
-            j = side // 2 + int(xy[0, k])
-            uu = patch[i, j - 1] - 2.0 * patch[i, j] + patch[i, j + 1]
-            vv = patch[i - 1, j] - 2.0 * patch[i, j] + patch[i + 1, j]
+            m = at[k]
+            twice = 2.0 * patch[m]
+            uu = patch[m - 1] - twice + patch[m + 1]
+            vv = patch[m - side] - twice + patch[m + side]
             uv = (
-                patch[i + 1, j + 1]
-                - patch[i + 1, j - 1]
-                - patch[i - 1, j + 1]
-                + patch[i - 1, j - 1]
+                patch[m + side + 1]
+                - patch[m + side - 1]
+                - patch[m - side + 1]
+                + patch[m - side - 1]
             )
-            column[0] = patch[i, j] - 128.0
-            column[1] = 1.0
-            column[2] = 0.5 * (uu + vv)
-            column[3] = 0.25 * ((x * x - y * y) * (uu - vv) + x * y * uv)
-            column[4] = views[n, k] - 128.0
-            for a in range(4):
-                product[a] += weights[k] * column[a] * column[4]
-                for b in range(a + 1):
-                    normal[a, b] += weights[k] * column[a] * column[b]
-            square += weights[k] * column[4] * column[4]
+            columns[0, k] = patch[m] - 128.0
+            columns[1, k] = 1.0
+            columns[2, k] = 0.5 * (uu + vv)
+            columns[3, k] = 0.25 * ((x * x - y * y) * (uu - vv) + x * y * uv)
+            columns[4, k] = views[n, k] - 128.0
+        for a in range(5):
+            for k in range(size):
+                weighted[a, k] = weights[k] * columns[a, k]
+        for a in range(4):
+            product[a] = dot(weighted[a], columns[4])
+            for b in range(a + 1):
+                normal[a, b] = dot(weighted[a], columns[b])
+        square = dot(weighted[4], columns[4])
         for a in range(4):
             normal[a, a] += 1e-9 * normal[a, a] + 1e-9
         invert_positive(normal, inverse)

@@ -18,7 +18,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.findings import Finding, begun, ended
 from vio.geometry.lie import FloatArray
-from vio.numerics.compiled import compiled, compiled_sums
+from vio.numerics.compiled import compiled, dot
 from vio.numerics.kinds import Capacity
 from vio.numerics.robust import median
 from vio.records import Image, IntArray, Observations, shared_rows
@@ -227,7 +227,8 @@ def _products(
         _differences(newest, u, v, parts[3])
         for i in range(4):
             for j in range(min(i + 1, 3)):
-                products[n, i, j] = _product(parts[i], parts[j])
+                # of whole numbers, so exact, whatever the order
+                products[n, i, j] = dot(parts[i], parts[j])
                 if i < 3:
                     products[n, j, i] = products[n, i, j]
 
@@ -243,12 +244,3 @@ def _differences(image: Image, u: int, v: int, differences: FloatArray) -> None:
             differences[k] = along
             differences[k + 1] = down
             k += 2
-
-
-@compiled_sums
-def _product(values: FloatArray, others: FloatArray) -> float:
-    """Sum of products of whole numbers: exact, whatever the order."""
-    total = 0.0
-    for k in range(len(values)):
-        total += values[k] * others[k]
-    return total

@@ -160,6 +160,15 @@ def has_compiled() -> bool:
     return any(loop.is_compiled_anew for loop in LOOPS)
 
 
+@compiled_sums
+def dot(a: FloatArray, b: FloatArray) -> float:
+    """Sum of the products of two arrays (n,)."""
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
+
+
 @compiled
 def invert_positive(A: FloatArray, out: npt.NDArray[np.floating[Any]]) -> None:
     """Write the inverse (n, n) of a symmetric positive definite matrix, whose lower triangle is
