@@ -9,6 +9,7 @@ import numpy as np
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, z_D_p_cam
+from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import MotionPrior
 
@@ -51,7 +52,7 @@ class ExpectedMotion:
         fit[:3, :3] += _ERRORS.scale_sigma**2 * moved_m2 * np.eye(3)
         if self.disparity_error_px > 0.0:
             # a translation is off as its depths are; one that no sensor has measured is, too
-            depth = float(np.median(depth_of(self.camera, p_prev)))
+            depth = median(depth_of(self.camera, p_prev))
             f_baseline = self.camera.fu * self.camera.baseline_m
             scale = self.disparity_error_px / _ERRORS.bound_sigmas * depth / f_baseline
             if not self.prior.measured:

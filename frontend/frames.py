@@ -164,8 +164,12 @@ def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
     ids = prior.ids
     z = prior.z
     if (ids[1:] <= ids[:-1]).any():
-        ids, first = np.unique(ids, return_index=True)
-        z = z[first]
+        order = ids.argsort(kind="stable")
+        ids = ids[order]
+        is_first = np.ones(len(ids), dtype=np.bool_)
+        is_first[1:] = ids[1:] != ids[:-1]
+        ids = ids[is_first]
+        z = z[order[is_first]]
     finite = np.isfinite(z[:, :2]).all(axis=1)
     R = prior.R_cam_prev
     if R is not None and not _is_rotation(R):

@@ -44,6 +44,7 @@ from vio.frontend.outliers import (
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
 from vio.numerics.kinds import Tolerance
+from vio.numerics.robust import median, quantile
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray, MotionPrior
 
@@ -313,9 +314,9 @@ def _lie_apart(rows: FloatArray, other: FloatArray) -> bool:
     if min(len(rows), len(other)) < MIN_POINTS:
         return False
     share = _TORN_SHARE
-    low, high = np.quantile(rows, (1.0 - share, share))
-    other_low, other_high = np.quantile(other, (1.0 - share, share))
-    return bool(high < other_low or other_high < low)
+    low, high = (quantile(rows, part) for part in (1.0 - share, share))
+    other_low, other_high = (quantile(other, part) for part in (1.0 - share, share))
+    return high < other_low or other_high < low
 
 
 def _elected_motion(case: _Case, second: _Second) -> TwoMotions | None:
@@ -439,7 +440,7 @@ def _without_slow_object(
         return None
     T, _ = best_motion(problem, p_prev[old], pixels[old], expected.prior.T_curr_prev[None])
     errors = pixel_errors(problem.camera, T, p_prev, pixels)
-    usual_px = _VOTE.following_ratio * float(np.median(errors[old]))
+    usual_px = _VOTE.following_ratio * median(errors[old])
     follows = np.asarray(errors <= min(usual_px, problem.limit_px))
     moving = found.inliers & ~follows
     # old points that do not follow: the scene is no better known than what came into view
@@ -470,7 +471,7 @@ def without_young_object(
         return None
     T, _ = best_motion(problem, p_prev[static], pixels[static], found.T_curr_prev[None])
     errors = pixel_errors(problem.camera, T, p_prev, pixels)
-    usual_px = _VOTE.following_ratio * float(np.median(errors[static]))
+    usual_px = _VOTE.following_ratio * median(errors[static])
     kept = static | (errors <= min(usual_px, problem.limit_px))
     moving = found.inliers & ~kept
     if not moving.any():

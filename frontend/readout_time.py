@@ -22,7 +22,7 @@ from vio.geometry.lie import FloatArray, circledot
 from vio.geometry.stereo import DEPTH_DISPARITY_PX, StereoCamera, project, triangulate, z_D_p_cam
 from vio.numerics.compiled import move_poses
 from vio.numerics.kinds import Tolerance
-from vio.numerics.robust import NormalEquations, cauchy_equations
+from vio.numerics.robust import NormalEquations, cauchy_equations, median
 from vio.records import NS_PER_S, IntArray, Observations, shared_rows
 
 
@@ -162,7 +162,7 @@ class ReadoutTime(Finder):
         every = 1 if self._passes else -(-len(chosen) // _RULES.max_features)
         chosen = chosen[::every]
         z = np.stack([seen.z[rows[k, chosen]] for k, seen in enumerate(frames)])
-        if np.median(np.abs(z[-1] - z[0])[:, :2].max(axis=1)) < _RULES.least_motion_px:
+        if median(np.abs(z[-1] - z[0])[:, :2].max(axis=1)) < _RULES.least_motion_px:
             return None
         z = z.reshape(-1, 4)
         return _Shown(

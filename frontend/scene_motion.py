@@ -26,6 +26,7 @@ from vio.frontend.outliers import Consensus, RansacProblem
 from vio.frontend.rig_in_view import RigInView
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, project
+from vio.numerics.robust import median
 from vio.records import BoolArray, TrackPrior
 
 
@@ -91,7 +92,7 @@ class _Scene:
         for motion in (self.motion.T_curr_prev, T):
             after = project(camera, transform_points(motion, p_prev))[:, :2]
             flow_px = np.linalg.norm(after - before, axis=1)
-            if float(np.median(flow_px)) <= _VIEW.min_flow_px:
+            if median(flow_px) <= _VIEW.min_flow_px:
                 return False
         return True
 

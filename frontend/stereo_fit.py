@@ -27,7 +27,7 @@ from vio.frontend.tracks import ANCHOR_REACH_PX, INLIER_PX, AnchorBank, Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, depth_of
 from vio.numerics.compiled import compiled
-from vio.numerics.robust import median
+from vio.numerics.robust import median, quantile
 from vio.records import BoolArray, Image, IntArray
 
 
@@ -227,7 +227,7 @@ class StereoFit:
         beyond = self._beyond(left_half, right_half, points)
         if not _are_enough(len(beyond), len(points)):
             return False
-        farthest = min(np.quantile(beyond, _STEREO.within_reach), self._most_reach_px)
+        farthest = min(quantile(beyond, _STEREO.within_reach), self._most_reach_px)
         while self.max_disparity_px < farthest:
             self._double_reach()
         return True

@@ -20,7 +20,7 @@ from vio.findings import Finding, Integrity
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled
-from vio.numerics.kinds import Tolerance
+from vio.numerics.kinds import Capacity, Tolerance
 
 NS_PER_S = 10**9
 MAX_GYRO_BIAS_RADPS = 0.5  # no sensor that works has more
@@ -36,6 +36,9 @@ BodyFrame: TypeAlias = Literal["imu", "cam0"]
 Orientations: TypeAlias = Literal["stated", "w first, assumed", "w last, assumed", "none"]
 MotionSource: TypeAlias = Literal["imu", "velocity"]
 RunMotion: TypeAlias = Literal["imu", "velocity", "none"]  # none: images alone
+
+
+_ID_SPAN: Capacity[int] = 32  # ids between the first and the last of a frame, for each feature
 
 
 class _RotationRules(NamedTuple):
@@ -272,27 +275,36 @@ def shared_rows(ids: IntArray, other: IntArray) -> tuple[IntArray, IntArray]:
 
 @compiled
 def _meet(ids: IntArray, other: IntArray, rows: IntArray, others: IntArray) -> int:
-    """Write where ids (N,) and (M,) that ascend are the same, and return how often; -1: they do
-    not ascend.
+    """Write where ids (N,) and (M,) are the same, in their order, and return how often; -1: they
+    are too far apart for a table of all between them.
     """
-    a = b = count = 0
-    while a < len(ids) and b < len(other):
-        if (a and ids[a] <= ids[a - 1]) or (b and other[b] <= other[b - 1]):
-            return -1
-        if ids[a] == other[b]:
-            rows[count] = a
-            others[count] = b
+    if not len(rows):
+        return 0
+    first = max(ids.min(), other.min())
+    last = min(ids.max(), other.max())
+    if last < first:
+        return 0
+    if float(last) - float(first) >= _ID_SPAN * (len(ids) + len(other)):  # whole ones overflow
+        return -1
+    span = last - first + 1
+    row = np.empty(span, np.int64)
+    for k in range(span):
+        row[k] = -1
+    for k in range(len(ids)):
+        if first <= ids[k] <= last:
+            row[ids[k] - first] = k
+    place = np.empty(span, np.int64)
+    for k in range(span):
+        place[k] = -1
+    for k in range(len(other)):
+        if first <= other[k] <= last:
+            place[other[k] - first] = k
+    count = 0
+    for k in range(span):
+        if row[k] >= 0 and place[k] >= 0:
+            rows[count] = row[k]
+            others[count] = place[k]
             count += 1
-        # both go on where they are the same
-        step = ids[a] <= other[b]
-        b += other[b] <= ids[a]
-        a += step
-    for k in range(max(a, 1), len(ids)):
-        if ids[k] <= ids[k - 1]:
-            return -1
-    for k in range(max(b, 1), len(other)):
-        if other[k] <= other[k - 1]:
-            return -1
     return count
 
 

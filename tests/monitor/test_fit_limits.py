@@ -452,7 +452,7 @@ def _unmoved_until(rows: int) -> bool:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(frozen, "_images", lambda _: [0])
         patch.setattr(frozen, "corner_flow", lambda old, new, pixels: flow[: len(pixels)])
-        return frozen._unmoved(frame, frame, seen)
+        return frozen._unmoved(frame, frame, seen.z, seen.has_right)
 
 
 def _remembers(frames: int) -> bool:

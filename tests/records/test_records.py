@@ -60,3 +60,16 @@ def test_a_trajectory_is_moved_to_the_other_frame_once() -> None:
     cam0 = imu.in_cam0(T_cam0_imu)
     np.testing.assert_allclose(cam0.positions, [[-1.0, -2.0, -3.0]] * 2)
     np.testing.assert_allclose(cam0.in_imu(T_cam0_imu).positions, 0.0)
+
+
+@pytest.mark.parametrize("spread", [1, 7, 10**6, 2**60])
+def test_shared_rows_are_in_the_order_of_the_ids(spread: int) -> None:
+    """Also of ids that are far apart, as hashes are, whose differences overflow."""
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        ids, others = (
+            (rng.permutation(16)[:count] - 8) * spread for count in rng.integers(0, 12, 2)
+        )
+        rows, of_others = shared_rows(ids, others)
+        common = sorted(set(ids.tolist()) & set(others.tolist()))
+        assert ids[rows].tolist() == others[of_others].tolist() == common

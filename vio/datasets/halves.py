@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.datasets.images import UnreadableImageError
+from vio.numerics.arrays import distinct
 from vio.numerics.kinds import Tolerance
 from vio.records import Image
 
@@ -42,7 +43,7 @@ def halves_note(count: int, load: Callable[[int], Image]) -> str | None:
         count: of the images.
         load: reads one of them (H, W); called with increasing numbers.
     """
-    wanted = np.unique(np.linspace(0, count - 1, min(count, _RULES.images)).astype(int))
+    wanted = distinct(np.linspace(0, count - 1, min(count, _RULES.images)).astype(int))
     try:
         found = [_correlation(load(k)) for k in wanted.tolist()]
     except UnreadableImageError:

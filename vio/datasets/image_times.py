@@ -27,6 +27,7 @@ from vio.files.dates import dates_in_names
 from vio.files.stamps import ASSUMED_STEP_NS, FRAME_PACE, check_digits, parse_stamps
 from vio.files.text import text_lines
 from vio.files.units import TIME_UNITS, time_unit, time_unit_in_words
+from vio.numerics.robust import median
 from vio.records import NS_PER_S, IntArray
 
 _MIN_LEFT_OUT = 10  # numbers between the last image and the first one of such a recording
@@ -123,7 +124,7 @@ def rolled_doubt(files: ImageFiles) -> tuple[str, ...]:
     steps = np.diff(found)
     if found[0] != 0 or found[-1] != 10**width - 1 or (steps <= 0).any():
         return ()
-    usual = int(np.median(steps))
+    usual = int(median(steps))
     holes = np.flatnonzero(steps != usual)
     if len(holes) != 1:
         return ()
@@ -174,7 +175,7 @@ def _check_stamps_apart(lefts: ImageFiles, rights: ImageFiles) -> None:
     right_ns = _name_times(rights)
     if left_ns is None or right_ns is None:
         return
-    apart_ms = np.median((right_ns[nearest(left_ns, right_ns)] - left_ns) / 1e6)
+    apart_ms = median((right_ns[nearest(left_ns, right_ns)] - left_ns) / 1e6)
     raise DataError(
         f"{lefts[0].parent} and {rights[0].parent}: the times that images are named by are "
         f"{apart_ms:+.4g} ms apart (right from left, median), and those of a pair must be within "
@@ -323,7 +324,7 @@ def _could_be_times(texts: Sequence[str]) -> bool:
     values = np.array([float(text) for text in texts])
     if len(values) < 2 or any(text.startswith("00") for text in texts):
         return False
-    step = float(np.median(np.diff(values)))
+    step = median(np.diff(values))
     if all("." in text for text in texts):
         return FRAME_PACE.least_s <= step <= FRAME_PACE.most_s
     return step * 1e-6 >= FRAME_PACE.least_s and bool((np.diff(values) > 0).all())
@@ -447,7 +448,7 @@ def _frame_counts(files: Sequence[Path]) -> IntArray:
         return in_order
     values: IntArray = np.array(numbers, dtype=np.int64)
     steps = values[1:] - values[:-1]
-    usual = int(np.median(steps))
+    usual = int(median(steps))
     if usual < 1 or (steps < usual).any() or (steps % usual != 0).any():
         return in_order
     counts = np.concatenate([[0], np.cumsum(steps // usual)])
@@ -507,7 +508,7 @@ def _is_named_list(file: Path) -> bool:
 def _slow_note(file: Path, times_ns: IntArray) -> tuple[str, ...]:
     """Doubt the unit of times that are further apart than those of any camera that moves."""
     if len(times_ns) > 1:
-        apart_s = float(np.median(np.diff(times_ns))) / NS_PER_S
+        apart_s = median(np.diff(times_ns)) / NS_PER_S
     else:
         apart_s = 0.0
     if apart_s <= FRAME_PACE.most_s:  # times in milliseconds are further apart
@@ -679,7 +680,7 @@ def _of_left_camera(
     ):
         return None
     left, right = np.array([fields[1:] for _, fields in rows], dtype=np.float64).T
-    if np.abs(right - left).max() >= np.median(np.abs(np.diff(left))):
+    if np.abs(right - left).max() >= median(np.abs(np.diff(left))):
         return None
     return _by_number({int(fields[0]): (n, fields[1]) for n, fields in rows}, pairs)
 

@@ -38,6 +38,7 @@ from vio.files.units import (
 from vio.geometry.lie import FloatArray
 from vio.imu.sampling import sampling_notes
 from vio.imu.two_sensors import JOINED, joined_record, parted_sensors
+from vio.numerics.robust import median
 from vio.records import NS_PER_S, BoolArray, ImuRecord, IntArray, VelocitySample
 
 _NUMBER = re.compile(
@@ -365,14 +366,14 @@ def _shared(times_ns: IntArray) -> BoolArray:
     apart = steps[steps > 0]
     if not alone or (steps < 0).any() or not len(apart):
         return np.zeros_like(shared)
-    is_fine = np.gcd.reduce(apart) <= _FINE * np.median(apart)
+    is_fine = np.gcd.reduce(apart) <= _FINE * median(apart)
     return shared if is_fine else np.zeros_like(shared)
 
 
 def _fits(times_ns: IntArray, late: BoolArray) -> bool:
     """Return whether sorted times are further apart than half of the usual, and few were late."""
     steps = np.diff(np.sort(times_ns))
-    usual = np.median(steps)
+    usual = median(steps)
     place = np.searchsorted(np.sort(times_ns), times_ns[late])
     before = steps[np.maximum(place - 1, 0)]
     after = steps[np.minimum(place, len(steps) - 1)]
@@ -692,7 +693,7 @@ def _timed(table: NumberTable, times: Sequence[int]) -> NumberTable:
 
 def _in_nanoseconds(counts: Sequence[int]) -> tuple[str, ...]:
     """Return the stamps of a counter whose tick is told by how far readings are apart."""
-    step = np.median(np.abs(np.diff(counts))) if len(counts) > 1 else 0
+    step = median(np.abs(np.diff(counts))) if len(counts) > 1 else 0
     tick_ns = _COARSE_TICK_NS if step <= _MAX_COARSE_STEP else _FINE_TICK_NS
     return tuple(str(count * tick_ns) for count in counts)
 

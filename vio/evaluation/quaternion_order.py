@@ -17,6 +17,7 @@ from vio.evaluation.errors_along_path import rotation_angle_deg
 from vio.evaluation.reference_axes import with_other_order
 from vio.geometry.lie import FloatArray, nearest_rotation
 from vio.numerics.kinds import Tolerance
+from vio.numerics.robust import median
 from vio.records import Trajectory
 
 
@@ -110,4 +111,4 @@ def _spread_deg(estimate: Trajectory, reference: Trajectory, limit_s: float) -> 
     R_ref_world = np.swapaxes(T_ref[:, :3, :3], 1, 2)
     R = R_ref_world @ alignment.R @ T_est[:, :3, :3]
     mean: FloatArray = nearest_rotation(R.sum(axis=0))
-    return float(np.median(rotation_angle_deg(mean.T @ R)))
+    return median(rotation_angle_deg(mean.T @ R))

@@ -36,6 +36,7 @@ from vio.geometry.lie import (
     se3_inverse,
 )
 from vio.numerics.kinds import Capacity, Tolerance
+from vio.numerics.robust import median
 from vio.records import BodyFrame, BoolArray, IntArray, Orientations, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -224,7 +225,7 @@ def _rises_as_a_clock(values: FloatArray) -> bool:
     steps = np.diff(values)
     if len(steps) == 0 or not (steps > 0).all():
         return False
-    usual = float(np.median(steps))
+    usual = median(steps)
     even = np.abs(steps - usual) <= _POSES.even_step * usual
     return float(np.mean(even)) >= _POSES.even_steps
 

@@ -32,6 +32,7 @@ from vio.filters.window import Window
 from vio.filters.window_tracks import VIEW_PROBABILITY, LinearTracks, chi_square_table
 from vio.geometry.lie import FloatArray, length, so3_exp, so3_hat, so3_log
 from vio.numerics.kinds import Tolerance
+from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import MAX_GYRO_BIAS_RADPS, BoolArray
 
@@ -410,7 +411,7 @@ def _robust_fit(
     z = r.ravel()
     # the first scale is that of the residuals themselves, as all of them are off together
     squared: FloatArray = np.einsum("fi,fi->f", r, r)
-    scale = max(width, float(np.median(squared)))
+    scale = max(width, median(squared))
     for _ in range(_MOTION.steps):
         weighted = np.repeat(1 / (1 + squared / scale), 4)[:, None] * H / variance
         A = weighted.T @ H + information

@@ -48,6 +48,7 @@ from vio.geometry.upright import rotation_to_up
 from vio.imu.settings import ImuSettings
 from vio.imu.standstill import STANDSTILL_S
 from vio.numerics.kinds import Tolerance
+from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import ImuSample, Observations, shared_rows
 
@@ -128,7 +129,7 @@ def is_still(
         return False
     flow_px = before[-1].z[a, :2] - now.z[b, :2]
     moved = np.linalg.norm(flow_px, axis=1)
-    return bool(np.median(moved) < _START.still_px) and imu_start(samples, now.time_ns, imu).still
+    return bool(median(moved) < _START.still_px) and imu_start(samples, now.time_ns, imu).still
 
 
 class MonoStarter:
@@ -361,7 +362,7 @@ class MonoStarter:
         show.
         """
         _, squares, dof = tracks.gate(lin.at)
-        ratio = float(np.median(squares / chi_square_table(0.5)[dof]))
+        ratio = median(squares / chi_square_table(0.5)[dof])
         tracks.variance = float(
             np.clip(tracks.variance * ratio, _START.min_px**2, self._settings.pixel_sigma_max_px**2)
         )

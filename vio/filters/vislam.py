@@ -19,6 +19,7 @@ from vio.filters.vislam_motion import DriftingTwist, HeldInput
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, p_cam_D_z, project, triangulate, z_D_p_cam
 from vio.imu.settings import ImuSettings
+from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile
 from vio.protocols import Backend
 from vio.records import (
@@ -344,7 +345,7 @@ class Vislam(Backend):
         gated = unseen + int((~accepted).sum())
         if not accepted.any():
             return 0, gated, None, None
-        innovation = float(np.median(np.abs(residual[accepted])))
+        innovation = median(np.abs(residual[accepted]))
         nis_per_dof = float(nis[accepted].mean() / 4)
         m = m[accepted]
         P = P[accepted]

@@ -28,6 +28,7 @@ from vio.frontend.scene_motion import SceneMotion
 from vio.frontend.stereo_match import EpipolarRowModel
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
+from vio.numerics.robust import median
 from vio.records import BoolArray, IntArray, Observations, TrackPrior, shared_rows
 
 
@@ -208,7 +209,7 @@ class ObjectMatches(Finder):
     def _learn(self, points: MovedPoints, found: Consensus) -> FloatArray:
         """Learn how far features usually are from one motion; return how far (N,) these are, px."""
         errors = pixel_errors(self._camera, found.T_curr_prev, points.p_prev, points.pixels)
-        median_px = min(float(np.median(errors)), _OBJECTS.max_usual_px)
+        median_px = min(median(errors), _OBJECTS.max_usual_px)
         self._frames += 1
         gain = max(_OBJECTS.usual_gain, 1.0 / self._frames)
         self._usual_px += gain * (median_px - self._usual_px)

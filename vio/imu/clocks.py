@@ -8,6 +8,7 @@ import numpy as np
 
 from vio.files.epochs import epoch_hint
 from vio.imu.findings import InertialFinding
+from vio.numerics.robust import median
 from vio.records import S_PER_NS, IntArray
 
 
@@ -40,7 +41,7 @@ def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[Iner
     covered = float(np.mean((frame_times_ns >= imu[0]) & (frame_times_ns <= imu[1])))
     step_ns = 0.0
     if len(imu_times_ns) > 1:
-        step_ns = float(np.median(np.diff(imu_times_ns)))
+        step_ns = median(np.diff(imu_times_ns))
     if covered == 0.0:
         return (_no_overlap(frames, imu, step_ns),)
     uncovered_s = (1 - covered) * (frames[1] - frames[0]) * S_PER_NS

@@ -25,6 +25,7 @@ from vio.geometry.lie import (
     so3_left_jacobian_inverse,
     so3_log,
 )
+from vio.numerics.robust import median
 from vio.records import ImuDensities
 
 _LONG_PERIODS = 3.0  # samples further apart than so many median periods lack some between
@@ -148,7 +149,7 @@ def preintegrate(
     P = np.zeros((count, 9, 9))
     D = np.zeros((count, 9, 6))
     spacing = np.concatenate([[np.inf], np.diff(t), [np.inf]])
-    lacks_samples = spacing > _LONG_PERIODS * np.median(spacing[1:-1])
+    lacks_samples = spacing > _LONG_PERIODS * median(spacing[1:-1])
     white = np.repeat(np.square([readings.densities.gyro, readings.densities.accel]), 3)
     first = np.searchsorted(t, start_s, side="right")
     last = np.searchsorted(t, end_s, side="left")

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vio.geometry.lie import FloatArray
+from vio.numerics.robust import median
 from vio.records import ImuRecord, IntArray
 
 
@@ -74,7 +75,7 @@ def joined_record(
         return None
     after = np.clip(np.searchsorted(accel_ns, times), 1, len(accel_ns) - 1)
     steps = np.diff(accel_ns)
-    longest = max(GAPS.usual_intervals * float(np.median(steps)), GAPS.min_ns)
+    longest = max(GAPS.usual_intervals * median(steps), GAPS.min_ns)
     inside = (times >= accel_ns[0]) & (times <= accel_ns[-1]) & (steps[after - 1] <= longest)
     if not inside.any():
         return None

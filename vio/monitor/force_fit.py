@@ -15,7 +15,7 @@ from vio.monitor.gyro_fit import AGREES, FIRST_EVALUATION, GyroFit
 from vio.monitor.motion import Record
 from vio.monitor.turned_imu import Turn
 from vio.numerics.kinds import Tolerance
-from vio.numerics.robust import jackknife
+from vio.numerics.robust import jackknife, median
 from vio.records import BoolArray
 
 WINDOW_S = 2.0
@@ -152,7 +152,7 @@ def fit_force(
     for _ in range(_PRIORS.reweightings):
         x = np.linalg.solve(np.tensordot(weight, N, 1) + prior, weight @ h)
         misfit = np.maximum(c - 2 * h @ x + np.einsum("i,wij,j->w", x, N, x), 0)
-        weight = 1 / (1 + misfit / max(4 * float(np.median(misfit)), 1e-9)) ** 2
+        weight = 1 / (1 + misfit / max(4 * median(misfit), 1e-9)) ** 2
     return ForceFit(N, h, c, weight, window_s)
 
 

@@ -32,6 +32,7 @@ from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import (
     S_PER_NS,
+    BoolArray,
     Image,
     ImuSample,
     IntArray,
@@ -299,11 +300,12 @@ class FrozenImages:
         if self._seen is None or expected is None:
             return None
         if self._repeating is not None and self._repeating.certain:
-            frozen = _unmoved(shown, frame, self._seen)
+            frozen = _unmoved(shown, frame, self._seen.z, self._seen.has_right)
             return Repeated(shown.index, False) if frozen else None
         since = self._paused_since()
         if since is not None:
-            frozen = _unmoved(shown, frame, self._seen) and not self._at_standstill()
+            unmoved = _unmoved(shown, frame, self._seen.z, self._seen.has_right)
+            frozen = unmoved and not self._at_standstill()
         else:
             frozen = self._has_stopped(frame, shown, self._seen, expected)
         return Repeated(shown.index, False, since=since) if frozen else None
@@ -333,9 +335,11 @@ class FrozenImages:
         if len(self._errors_px) < _FLOW.min_recent_frames or not self._contradicts(expected.motion):
             return False
         predicted_px = max(_FLOW.min_predicted_px, _FLOW.prediction_errors * max(self._errors_px))
-        moving = _predicted_to_move(seen, expected, predicted_px)
+        moving = _motion(seen, expected.tracks)
+        rows = moving.rows[lengths(moving.px) > predicted_px]
         # The IMU comes last, as nearly every new frame has moved.
-        return _unmoved(shown, frame, moving) and not self._at_standstill()
+        unmoved = _unmoved(shown, frame, seen.z[rows], seen.has_right[rows])
+        return unmoved and not self._at_standstill()
 
     def _moves(self, expected: Prediction | None) -> bool:
         """Whether the rig moves: by the last frames' features, the IMU's samples, else by the
@@ -428,20 +432,14 @@ def _same_depths(a: FloatArray, b: FloatArray) -> bool:
     return a.shape == b.shape and np.array_equal(a, b, equal_nan=True) and bool(np.any(a > 0))
 
 
-def _predicted_to_move(seen: Observations, expected: Prediction, least_px: float) -> Observations:
-    """The features of the last frame that the prediction moves clearly in the left image."""
-    motion = _motion(seen, expected.tracks)
-    return seen.take(motion.rows[lengths(motion.px) > least_px])
-
-
 def _images(frame: StereoFrame) -> list[Image]:
     """The images of a frame: left and right, or that of one camera."""
     return [image for image in (frame.left, frame.right) if image is not None]
 
 
-def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
-    """Whether features have not moved since they were seen, in both images."""
-    of_images = seen.z[: _FLOW.corners, :2], seen.z[seen.has_right][: _FLOW.corners, 2:]
+def _unmoved(before: StereoFrame, now: StereoFrame, z: FloatArray, has_right: BoolArray) -> bool:
+    """Whether features have not moved since they were seen at pixels (N, 4), in both images."""
+    of_images = z[: _FLOW.corners, :2], z[has_right][: _FLOW.corners, 2:]
     for old, new, pixels in zip(_images(before), _images(now), of_images, strict=False):
         flow = corner_flow(old, new, pixels)
         if (
@@ -559,20 +557,25 @@ def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:
     Exact for no motion; for motions of many pixels it only says that there is one. Patches that
     leave the image are left out, so M <= N.
     """
-    height, width = before.shape
-    margin = _RADIUS + 1
-    at = np.rint(pixels).astype(np.int64)
-    inside = np.all((at >= margin) & (at < np.array([width, height]) - margin), axis=1)
-    flow = np.empty((int(inside.sum()), 2))
-    _write_flow(before, after, at[inside], flow)
-    return flow
+    flow = np.empty((len(pixels), 2))
+    count = _write_flow(before, after, np.ascontiguousarray(pixels), flow)
+    return flow[:count]
 
 
 @compiled
-def _write_flow(before: Image, after: Image, at: IntArray, flow: FloatArray) -> None:
-    """Write the flow (M, 2) of patches around whole pixels (M, 2)."""
+def _write_flow(before: Image, after: Image, pixels: FloatArray, flow: FloatArray) -> int:
+    """Write the flow (M, 2) of patches around pixels (N, 2) that are inside; return their number."""
     size = (2 * _RADIUS + 1) ** 2
-    for m in range(len(at)):
+    margin = _RADIUS + 1
+    height, width = before.shape
+    m = 0
+    for n in range(len(pixels)):
+        u = np.rint(pixels[n, 0])
+        v = np.rint(pixels[n, 1])
+        if not (margin <= u < width - margin and margin <= v < height - margin):
+            continue
+        column = int(u)
+        row = int(v)
         uu = 1.0  # one gray level squared, against patches without texture
         uv = 0.0
         vv = 1.0
@@ -581,8 +584,8 @@ def _write_flow(before: Image, after: Image, at: IntArray, flow: FloatArray) -> 
         u_sum = 0.0
         v_sum = 0.0
         change = 0.0
-        for y in range(at[m, 1] - _RADIUS, at[m, 1] + _RADIUS + 1):
-            for x in range(at[m, 0] - _RADIUS, at[m, 0] + _RADIUS + 1):
+        for y in range(row - _RADIUS, row + _RADIUS + 1):
+            for x in range(column - _RADIUS, column + _RADIUS + 1):
                 gu = 0.5 * (float(before[y, x + 1]) - float(before[y, x - 1]))
                 gv = 0.5 * (float(before[y + 1, x]) - float(before[y - 1, x]))
                 t = float(after[y, x]) - float(before[y, x])
@@ -599,3 +602,5 @@ def _write_flow(before: Image, after: Image, at: IntArray, flow: FloatArray) -> 
         det = uu * vv - uv * uv
         flow[m, 0] = -(vv * ut - uv * vt) / det
         flow[m, 1] = -(uu * vt - uv * ut) / det
+        m += 1
+    return m

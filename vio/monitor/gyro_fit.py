@@ -14,8 +14,9 @@ from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray, nearest_rotation
 from vio.imu.findings import MAX_FOLLOWED_OFFSET_S, InertialFinding
 from vio.monitor.motion import Record
+from vio.numerics.arrays import distinct
 from vio.numerics.kinds import Tolerance
-from vio.numerics.robust import robust_sigma, robust_sigmas
+from vio.numerics.robust import median, medians, robust_sigma, robust_sigmas
 from vio.records import BoolArray
 
 
@@ -132,7 +133,7 @@ class GyroFit:
         camera = self.camera[self.covered] @ R
         gyro = self.gyro[self.covered]
         # a few wrong rates of the camera are no rotation; what there is of the gyro's is
-        total = np.minimum(robust_sigmas(camera - np.median(camera, axis=0)), camera.std(axis=0))
+        total = np.minimum(robust_sigmas(camera - medians(camera)), camera.std(axis=0))
         shown = gyro.std(axis=0)
         off = (camera - gyro).std(axis=0)
         clear = total > self._clear_radps
@@ -221,7 +222,7 @@ def agreed_until(record: Record, least: int, R_cam0_imu: FloatArray) -> float | 
     until = None
     if len(gyro) < 2 * least:
         return None
-    for length in np.unique(np.linspace(least, len(gyro) - least, _RATES.lengths).astype(np.int64)):
+    for length in distinct(np.linspace(least, len(gyro) - least, _RATES.lengths).astype(np.int64)):
         turns, g = (x[:length] - x[:length].mean(axis=0) for x in (camera, gyro))
         since, g_since = (x[length:] - x[length:].mean(axis=0) for x in (camera, gyro))
         S = g_since.T @ g_since
@@ -357,7 +358,7 @@ def judge_stamps(record: Record) -> InertialFinding | None:
     gyro = np.linalg.norm(means[0, :, :3], axis=1)
     camera = np.linalg.norm(record.twists[:, 3:], axis=1)
     dt = record.end - record.begin
-    usual = float(np.median(dt)) if len(dt) else 0.0
+    usual = median(dt) if len(dt) else 0.0
     used = covered[0] & (gyro > _JITTER.min_rate_radps) & (np.abs(dt - usual) < 0.5 * usual)
     if used.sum() < _JITTER.min_intervals or robust_sigma(dt[used] - usual) < _JITTER.min_sigma_s:
         return None

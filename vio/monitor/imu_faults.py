@@ -12,6 +12,7 @@ import numpy as np
 from vio.findings import Finding, begun, ended
 from vio.imu.faults import ImuFault, ImuFaultKind, ImuSampleCheck
 from vio.monitor.samples import GAP_S, GAP_STEPS
+from vio.numerics.robust import median
 from vio.records import S_PER_NS, ImuSample
 
 _RECENT = 200  # samples whose median distance is the usual one, and frames whose stamps are known
@@ -274,5 +275,5 @@ class ImuSilence:
             return None
         usual_s = 0.0
         if len(self._times) > 1:
-            usual_s = float(np.median(np.diff(self._times))) * S_PER_NS
+            usual_s = median(np.diff(self._times)) * S_PER_NS
         return None if length_s <= GAP_STEPS * usual_s else length_s

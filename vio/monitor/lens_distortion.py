@@ -17,6 +17,7 @@ from vio.cameras.rectification_error import vertical_disparity_terms
 from vio.findings import Finding, begun
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.arrays import distinct
 from vio.numerics.kinds import Tolerance
 from vio.numerics.robust import cauchy_fit, fits_without_blocks, jackknife, median
 from vio.records import IntArray, Observations
@@ -111,7 +112,7 @@ class LensCheck:
         is half the corners', and the standard error; None: too few features.
         """
         ids = np.concatenate([seen.ids for seen in self._matches])
-        if len(np.unique(ids)) < _LENS.min_features:
+        if len(distinct(ids)) < _LENS.min_features:
             return None
         z = np.concatenate([seen.z for seen in self._matches])
         terms = self._terms(z)

@@ -92,7 +92,7 @@ class TrackMisfit:
         if len(stated_px) < _MISFIT.min_features:
             return None
         self._indices.append(seen.frame_index)
-        self._excesses.append(misfit / self._explained(float(np.median(stated_px))))
+        self._excesses.append(misfit / self._explained(median(stated_px)))
         if len(self._excesses) < _MISFIT.frames:
             return None
         return median(np.array(self._excesses))

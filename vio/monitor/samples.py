@@ -13,6 +13,7 @@ from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.imu.findings import InertialFinding
 from vio.imu.two_sensors import GAPS
+from vio.numerics.arrays import distinct
 from vio.numerics.kinds import Capacity
 from vio.numerics.robust import median, robust_sigma
 from vio.records import S_PER_NS, BoolArray, ImuSample, IntArray
@@ -200,7 +201,7 @@ def _run_at_end(values: FloatArray, equal: BoolArray, at: BoolArray, axis: int) 
     run = _longest_run(at)
     if (
         run < max(_CLIPPING.min_run, 1 + chance)
-        or len(np.unique(values[:, axis])) < _CLIPPING.min_levels
+        or len(distinct(values[:, axis])) < _CLIPPING.min_levels
     ):
         return 0
     return run
@@ -259,7 +260,7 @@ def judge_size(
     """
     if not is_long_enough(times_ns):
         return Size(None, 1.0)
-    step_s = float(np.median(np.diff(times_ns))) * S_PER_NS
+    step_s = median(np.diff(times_ns)) * S_PER_NS
     usual, spread = _usual_size(times_ns, accel)
     return _judge_setting(usual, spread, gravity_mps2) or _judge_median(usual, spread, step_s)
 

@@ -15,6 +15,7 @@ import numpy as np
 from vio.findings import Finding, begun, ended
 from vio.geometry.lie import FloatArray
 from vio.numerics.kinds import Capacity
+from vio.numerics.robust import medians
 from vio.records import BoolArray, Image
 
 
@@ -132,7 +133,7 @@ def _changed_share(before: Image, image: Image) -> float:
     limit = np.maximum(_STILL.changed_gray, _STILL.noise_sigmas * noise)
     old = _thin(before)
     new = _thin(image)
-    of_rows = np.median((new + 1.0) / (old + 1.0), axis=1, keepdims=True)
+    of_rows = medians(((new + 1.0) / (old + 1.0)).T)[:, None]
     was = _cells(old)[usable]
     now = _cells(new)[usable]
     gain, offset = _exposure(was, now)
@@ -172,7 +173,7 @@ def _by_cell(thin: FloatArray) -> FloatArray:
 
 def _cells(thin: FloatArray) -> FloatArray:
     """Medians (N,) of cells."""
-    return np.asarray(np.median(_by_cell(thin), axis=1))
+    return medians(_by_cell(thin).T)
 
 
 def _saturated(image: Image) -> BoolArray:

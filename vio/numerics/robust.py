@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from vio.numerics.arrays import FloatArray
+from vio.numerics.arrays import FloatArray, distinct
 
 _MEDIAN_TO_SIGMA = 1.4826  # standard deviation over median absolute value of a normal distribution
 _RIDGE = 1e-9  # of what the terms of a fit do not show
@@ -27,6 +27,16 @@ def median(values: npt.ArrayLike) -> float:
     if not count or ordered[-1] != ordered[-1]:
         return math.nan
     return float(ordered[middle] if count % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
+
+
+def medians(values: FloatArray) -> FloatArray:
+    """Return the medians (K,) of columns of values (N, K) as `median` does."""
+    ordered = np.sort(values, axis=0)  # NaN come last
+    middle = len(ordered) // 2
+    out = ordered[middle]
+    if len(ordered) % 2 == 0:
+        out = 0.5 * (ordered[middle - 1] + out)
+    return np.where(np.isnan(ordered[-1]), np.nan, out)
 
 
 def quantile(values: npt.ArrayLike, share: float) -> float:
@@ -60,12 +70,7 @@ def robust_sigmas(values: FloatArray) -> FloatArray:
     """Estimate the standard deviations (K,) of the columns of zero-mean values (N, K) as
     `robust_sigma` does.
     """
-    ordered = np.sort(np.abs(values), axis=0)  # NaN come last
-    middle = len(ordered) // 2
-    medians = ordered[middle]
-    if len(ordered) % 2 == 0:
-        medians = 0.5 * (ordered[middle - 1] + medians)
-    out: FloatArray = _MEDIAN_TO_SIGMA * np.where(np.isnan(ordered[-1]), np.nan, medians)
+    out: FloatArray = _MEDIAN_TO_SIGMA * medians(np.abs(values))
     return out
 
 
@@ -134,7 +139,7 @@ def fits_without_blocks(
         steps: number of them.
     """
     K = terms.shape[1]
-    of_block = np.unique(block)[:, None] == block
+    of_block = distinct(block)[:, None] == block
     columns = np.column_stack([terms, values])
     products = (terms[:, :, None] * columns[:, None, :]).reshape(len(values), -1)
     width = max(median((values - terms @ whole) ** 2), least**2)

@@ -14,6 +14,7 @@ from vio.evaluation.trajectories import Evaluation
 from vio.files.tables import Rows
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.upright import attitude_deg, rotated, upright_view
+from vio.numerics.arrays import distinct
 from vio.numerics.kinds import Capacity
 from vio.records import RIGHT_TERMS, Trajectory
 from vio.runs.finished import FinishedRun
@@ -278,7 +279,7 @@ def thinned(
     """Return at most `most` row numbers of `count` (None: all), evenly spread, with the first
     and the last.
     """
-    return np.unique(np.linspace(0, count - 1, min(count, most or count)).round().astype(np.int64))
+    return distinct(np.linspace(0, count - 1, min(count, most or count)).round().astype(np.int64))
 
 
 def _chosen_points(run: FinishedRun) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
