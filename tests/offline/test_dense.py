@@ -16,7 +16,13 @@ from tests.commands import json_of, refused
 from vio.cli import main
 from vio.dense.occupancy import occupancy_grid
 from vio.dense.preview import preview
-from vio.dense.stereo_depth import StereoMatcher, depth_sigma_m, farthest_m, slant
+from vio.dense.stereo_depth import (
+    DISPARITY_SIGMA_PX,
+    StereoMatcher,
+    depth_sigma_m,
+    farthest_m,
+    slant,
+)
 from vio.dense.surface import Mesh, extract_surface
 from vio.dense.voxel_grid import SIDE, VoxelGrid, pack, unpack
 from vio.files.meshes import FREE, OCCUPIED, R_GLTF_UPRIGHT, UNKNOWN, glb_mesh, ply_points
@@ -137,6 +143,28 @@ def test_depth_of_rendered_images_is_as_exact_as_stated() -> None:
     known = (depth > 0) & (truth < farthest_m(camera, 0.3))
     sigmas = np.abs(depth - truth)[known] / (depth_sigma_m(camera, 1.0) * truth[known] ** 2)
     assert np.median(sigmas) < 1.0  # 0.67 of a normal distribution
+
+
+@pytest.mark.parametrize("disparity_px", [10.0, 10.25, 10.5, 10.75])
+def test_the_sigma_of_a_match_covers_what_the_matcher_pulls_to_whole_pixels(
+    disparity_px: float,
+) -> None:
+    """A plane parallel to the images, of waves."""
+    rng = np.random.default_rng(1)
+    v, u = np.mgrid[:120, :320].astype(float)
+    waves = [(*rng.normal(0, 0.7, 2), rng.uniform(0, 2 * np.pi)) for _ in range(100)]
+    left, right = (
+        (128 + 5 * sum(np.cos(a * (u + shift) + b * v + c) for a, b, c in waves))
+        .clip(0, 255)
+        .astype(np.uint8)
+        for shift in (0.0, disparity_px)
+    )
+    depth = StereoMatcher(CAMERA, 320).depth(left, right)[10:-10, 60:-20]
+    known = depth > 0
+    assert known.mean() > 0.9
+    errors = CAMERA.fu * CAMERA.baseline_m / depth[known] - disparity_px
+    assert abs(errors.mean()) < DISPARITY_SIGMA_PX
+    assert np.sqrt(np.mean(errors**2)) < 1.1 * DISPARITY_SIGMA_PX
 
 
 def test_floor_plan_of_a_box_on_a_floor() -> None:

@@ -48,7 +48,7 @@ LIMITS = {
     "docs/live.md": 1320,
     "docs/maps.md": 1340,
     "docs/math.md": 6400,
-    "docs/neighbours.md": 1460,
+    "docs/neighbours.md": 1500,
     "docs/notes/consistency.md": 880,
     "docs/recordings.md": 1750,
     "docs/results.md": 2950,
@@ -56,7 +56,7 @@ LIMITS = {
     "docs/simulation.md": 1040,
     "docs/tutorials/target.md": 1390,
 }
-ALL_PAGES = 45_600
+ALL_PAGES = 45_700
 
 # Each with what to write in its place.
 BANNED = {

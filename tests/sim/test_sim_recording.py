@@ -19,7 +19,7 @@ from vio.errors import DataError, SimulationError, VioError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_inverse, transform_points
 from vio.geometry.stereo import project
 from vio.records import FrontendOutput, ImuSample, StereoFrame, VelocitySample
-from vio.sim.effects import CLEAN, SensorEffects, apply_effects, average_exposures
+from vio.sim.effects import CLEAN, SensorEffects, along_flow, apply_effects, average_exposures
 from vio.sim.export import export_euroc, export_kitti
 from vio.sim.imu import ImuNoise, VelocityNoise
 from vio.sim.motion import car_loop, hand_held, rotate_body_axes
@@ -421,3 +421,14 @@ def test_rows_of_a_rolling_shutter_show_their_own_time(plain: Simulation) -> Non
         assert off < 4.0
         if abs(late) > 20:
             assert off_at_once > 4 * off
+
+
+@pytest.mark.parametrize("part", [0.2, 0.25, 0.5, 0.8])
+def test_images_along_a_flow_are_moved_by_that_flow(part: float) -> None:
+    """The phase of a wave of 20 px tells by how much it was moved."""
+    u = np.tile(np.arange(200, dtype=np.float32), (8, 1))
+    flow = np.zeros((*u.shape, 2))
+    flow[..., 0] = part
+    moved = along_flow(np.cos(2 * np.pi * u / 20).astype(np.float32), flow)[4, 20:180]
+    wave = np.exp(-2j * np.pi * (np.arange(20, 180) + part) / 20)
+    assert abs(np.angle(np.sum(moved * wave))) * 20 / (2 * np.pi) < 0.015

@@ -209,8 +209,9 @@ def along_flow(image: Radiance, flow: FloatArray) -> Radiance:
     """Return the image (H, W) that shows at each pixel what another one has a flow (H, W, 2) from
     there, pixels.
     """
+    # INTER_CUBIC moves smooth images by up to 0.048 px (F126), this one by 0.015.
     at = (flow + _pixels(image.shape)).astype(np.float32)
-    return _looked_up(image, at, cv2.INTER_CUBIC)
+    return _looked_up(image, at, cv2.INTER_LANCZOS4)
 
 
 def _pixels(shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
