@@ -13,7 +13,15 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.monitor.calibration_drift import CalibrationDrift, ScaleDrift
 from vio.monitor.integrity import IntegrityMonitor
-from vio.records import FIELD_TERMS, Estimate, Observations, StereoFieldEstimate, observations
+from vio.monitor.run import RunMonitor
+from vio.records import (
+    FIELD_TERMS,
+    Estimate,
+    Observations,
+    StereoFieldEstimate,
+    UpdateReport,
+    observations,
+)
 
 CAMERA = StereoCamera(fu=400.0, fv=400.0, cu=320.0, cv=240.0, baseline_m=0.1, width=640, height=480)
 PRIOR_SIGMA = 2e-3
@@ -127,3 +135,18 @@ def test_frames_before_a_drift_was_seen_are_marked_once() -> None:
         marks += monitor.take_marks()
     assert [(m.since, m.before, m.integrity) for m in marks] == [(30, 50, "nominal")]
     assert 0.02 / 1.5 <= marks[0].share <= 0.02
+
+
+def test_a_run_states_what_a_camera_that_sags_lets_positions_be_off_by() -> None:
+    """Half of the 8 px at the end, over 40 frames and 4 m; without a sag nothing is added."""
+    for yaw, least_m, most_m in ((0.0, 0.0, 0.0), (0.01, 0.5, 4.0)):
+        monitor = RunMonitor(CAMERA, np.eye(4), imu=False)
+        for k in range(80):
+            now = constant_yaw(yaw * np.clip((k - 40) / 20, 0.0, 1.0))
+            given = estimate(k, now, PRIOR_SIGMA if k == 0 else KNOWN_SIGMA)
+            monitor.observations(seen(k))
+            monitor.update(k, UpdateReport(48, 0, 0, 0, 0.1, 1.0), given, measured=False)
+            judged = monitor.judged(k, given)
+        sigma_m = np.sqrt(max(judged.covariance[0, 0] - given.covariance[0, 0], 0.0))
+        assert judged.integrity == "nominal"
+        assert least_m <= sigma_m <= most_m
