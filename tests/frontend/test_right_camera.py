@@ -115,7 +115,7 @@ def test_a_frozen_left_image_is_known_and_named_once() -> None:
     line, again = lines
     assert again == "frame 8: the left camera gives new images again"
     assert line.startswith(
-        "frame 5: the left camera is frozen: its image does not change since frame 2"
+        "frame 5: the left camera is frozen: it gives earlier images again since frame 2"
     )
 
 

@@ -50,9 +50,14 @@ def test_a_view_of_which_nothing_is_left_is_named() -> None:
 
 
 def test_the_few_features_that_are_left_must_contradict_the_motion() -> None:
-    assert _codes([*USUAL, 128], 2.0) == ["view-changed"]  # 22 of 100, a quarter of 90
-    assert _codes([*USUAL, 128], 1.9) == []
-    assert _codes([*USUAL, 127], 2.0) == []
+    assert _codes([*USUAL, 113], 2.0) == ["view-changed"]  # 37 of 100: 0.41 of the usual 90
+    assert _codes([*USUAL, 113], 1.9) == []
+    assert _codes([*USUAL, 112], 2.0) == []
+
+
+def test_fewer_must_be_left_where_a_sensor_has_measured_the_motion() -> None:
+    assert _codes([*USUAL, 128], 2.0, measured=True) == ["no-features"]  # 22, a quarter of 90
+    assert _codes([*USUAL, 127], 2.0, measured=True) == []
 
 
 def test_a_motion_sensor_has_measured_the_motion() -> None:

@@ -45,8 +45,8 @@ class _FrozenRules:
 _FROZEN = _FrozenRules()
 
 _SEEN: dict[Cause, str] = {
-    "right-image-frozen": "the right camera is frozen: its image does not change while the left "
-    "one does",
+    "right-image-frozen": "the right camera is frozen: it gives earlier images again while the left "
+    "one changes",
     "right-image-dark": "the right camera is dark or covered: its image has no contrast while the "
     "left one has",
 }
@@ -171,8 +171,8 @@ class FrozenCamera(ImageCheck):
         self._left_frozen += 1
         if self._left_frozen == _FROZEN.frames:
             text = (
-                "the left camera is frozen: its image does not change since frame "
-                f"{since} while the right one does; the right images alone follow what the last "
+                "the left camera is frozen: it gives earlier images again since frame "
+                f"{since} while the right one changes; the right images alone follow what the last "
                 "pair has seen"
             )
             self._found.append(begun("left-image-frozen", index, text, since + 1))

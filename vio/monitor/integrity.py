@@ -14,6 +14,9 @@ covariance grows by is, too, long before a cause is found.
 Where the left images alone go on, nothing measures lengths any more. Their scale drifts, mostly to
 smaller ones, by more than the filter says: its motion model, noise of the pixels and linearisation
 pass for knowledge of it. So distances from there on are uncertain by a walk of the scale.
+
+Where what is estimated of the stereo calibration moves, lengths are in doubt by a share, and the
+position by this share of the path on which it moved.
 """
 
 from __future__ import annotations
@@ -35,10 +38,31 @@ _HOLDS_NS = NS_PER_S  # an event without an end is one of the second after it
 # findings on the state that was estimated, not on a sensor
 OF_THE_STATE = ("estimate-implausible", "estimate-restarted", "estimate-lost", "scale-off")
 _MIN_SPEED_MPS = 0.1  # of a rig that stands still as far as the estimate says
-# Levels of what the scale may be off by, over it: the first one, and from one to the next. Where
-# one is reached, earlier frames below it are brought to it.
-_MIN_SCALE_DOUBT = 0.005
+# Levels of what the scale may be off by, over it: from one to the next. Where one is reached, earlier
+# frames below it are brought to it.
 _SCALE_DOUBT_GROWS = 1.5
+_MAX_DRIFT_FRAMES = 40  # for which a calibration has moved before that is seen
+
+
+class _Levels(NamedTuple):
+    """Levels of a doubt of the scale, so that frames are marked again when much has changed."""
+
+    first: float  # doubt at which the first one begins; below is level 0, of no doubt
+
+    def of(self, doubt: float) -> int:
+        """Return the level of a doubt."""
+        if doubt < self.first:
+            return 0
+        return 1 + int(np.log(doubt / self.first) / np.log(_SCALE_DOUBT_GROWS))
+
+    def doubt(self, level: int) -> float:
+        """Return the doubt at which a level begins."""
+        return self.first * _SCALE_DOUBT_GROWS ** (level - 1) if level else 0.0
+
+
+_SCALE = _Levels(0.005)
+# half of what the settings state of a calibration, beside which less does not count
+_DRIFT = _Levels(0.0025)
 
 
 class _InnovationRules(NamedTuple):
@@ -122,6 +146,12 @@ class IntegrityMonitor:
         self._largest = 0.0
         # of the logarithm of a scale that nothing measures, and of what the position is off by for it
         self._unscaled = np.zeros((4, 4))
+        # steps of the last frames, and the level of the doubt of their lengths by a calibration that
+        # moves
+        self._steps_m = deque[float](maxlen=_MAX_DRIFT_FRAMES)
+        self._step_levels = deque[int](maxlen=_MAX_DRIFT_FRAMES)
+        self._drift: tuple[int, int] = 0, 0  # level and number of frames that the next one shows
+        self._drifted_m = 0.0  # that the position may be off by for it
         # frames and the level of the scale's doubt that their covariances have from there on: less
         # in each than in the one before
         self._scale_doubts: list[tuple[int, int]] = []
@@ -145,18 +175,22 @@ class IntegrityMonitor:
         """Take by what the scale may be off, over it, as a frame has shown; it was off in the
         frames before as well.
         """
-        level = 0
-        if doubt >= _MIN_SCALE_DOUBT:
-            level = 1 + int(np.log(doubt / _MIN_SCALE_DOUBT) / np.log(_SCALE_DOUBT_GROWS))
+        level = _SCALE.of(doubt)
         since = index
         while self._scale_doubts and self._scale_doubts[-1][1] <= level:
             before = since
             since, known = self._scale_doubts.pop()
             if known < level:
-                variance = _scale_doubt(level) ** 2 - _scale_doubt(known) ** 2
+                variance = _SCALE.doubt(level) ** 2 - _SCALE.doubt(known) ** 2
                 scale = float(np.sqrt(variance))
                 self._marks.append(Mark(since, before, "nominal", None, scale))
         self._scale_doubts.append((since, level))
+
+    def take_drift(self, share: float, frames: int) -> None:
+        """Take by what share lengths may be off, as a calibration has moved in so many frames up to
+        the coming estimate's.
+        """
+        self._drift = _DRIFT.of(share), frames
 
     def take_innovation(self, ratio: float | None) -> None:
         """Take the innovation of a frame over its standard deviation; None: nothing was seen."""
@@ -204,13 +238,15 @@ class IntegrityMonitor:
         held = [entry.finding for entry in self._holding.values()]
         integrity = worst([finding.effect for finding in held])
         step_ns = 0 if self._last is None else estimate.time_ns - self._last[0]
+        self._measure_drift(index, estimate)
         self._measure_speed(estimate, usable=integrity != "unusable")
         self._measure_doubt(estimate.time_ns, step_ns, held)
         self._measure_misled(estimate.covariance)
         unscaled = (
             float(np.linalg.eigvalsh(self._unscaled[1:, 1:])[-1]) if self._unscaled.any() else 0.0
         )
-        doubt_m = float(np.sqrt(self._doubt_m**2 + self._misled_m**2 + unscaled))
+        drifted = self._drifted_m**2
+        doubt_m = float(np.sqrt(self._doubt_m**2 + self._misled_m**2 + unscaled + drifted))
         if integrity == "nominal" and doubt_m == 0.0:
             return estimate
         codes = tuple(sorted(f.code for f in held if f.effect != "nominal"))
@@ -242,6 +278,27 @@ class IntegrityMonitor:
             known = max(known, share)
         moved_m = self._speed_mps * self._doubted_s
         self._doubt_m = float(np.hypot(self._carried_m, moved_m))
+
+    def _measure_drift(self, index: int, estimate: Estimate) -> None:
+        """Bring what the position may be off by for a calibration that moves to the present frame,
+        and mark the frames in which it had moved unseen.
+        """
+        last = self._last
+        position = estimate.T_world_imu[:3, 3]
+        self._steps_m.append(0.0 if last is None else length(position - last[1]))
+        self._step_levels.append(0)
+        level, frames = self._drift
+        self._drift = 0, 0
+        known = max(self._step_levels)
+        if level > known:
+            share = float(np.sqrt(_DRIFT.doubt(level) ** 2 - _DRIFT.doubt(known) ** 2))
+            self._marks.append(Mark(index - frames, index, "nominal", None, share=share))
+        for k in range(max(len(self._steps_m) - frames, 0), len(self._steps_m)):
+            before = self._step_levels[k]
+            if level > before:
+                more = _DRIFT.doubt(level) - _DRIFT.doubt(before)
+                self._drifted_m += more * self._steps_m[k]
+                self._step_levels[k] = level
 
     def _measure_misled(self, covariance: FloatArray) -> None:
         """Bring what innovations say of the position's errors to the present frame, of a stated
@@ -309,13 +366,6 @@ def _doubted_share(finding: Finding) -> float:
 def _mark(finding: Finding, since: int, before: int) -> Mark:
     share = _doubted_share(finding)
     return Mark(since, before, finding.effect, finding.code, share=share)
-
-
-def _scale_doubt(level: int) -> float:
-    """The doubt of the scale at which a level begins; 0 for none."""
-    if level == 0:
-        return 0.0
-    return _MIN_SCALE_DOUBT * _SCALE_DOUBT_GROWS ** (level - 1)
 
 
 def inflated(covariance: FloatArray, sigma_m: float) -> FloatArray:

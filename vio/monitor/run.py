@@ -455,6 +455,9 @@ class RunMonitor:
         if self._updates.contradiction is not None:
             self._integrity.take_innovation(frame.report.innovation_ratio)
         self._integrity.take_scale_doubt(index, frame.report.scale_doubt)
+        if frame.seen is not None:
+            drift = self._updates.calibration.frame(frame.seen, frame.estimate)
+            self._integrity.take_drift(drift.share, drift.frames)
 
     def _add_of_updates(self, findings: Iterable[Finding], known: Set[str] = frozenset()) -> None:
         """Report what updates show; messages that are known already, not again."""

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from vio.dataclass import dataclass
 from vio.findings import Finding
 from vio.geometry.stereo import StereoCamera
+from vio.monitor.calibration_drift import CalibrationDrift
 from vio.monitor.contradiction import ImuContradiction
 from vio.monitor.few_features import FewFeatures
 from vio.monitor.frame_order import FrameOrder
@@ -45,6 +46,7 @@ class UpdateChecks:
         self._order = FrameOrder()
         self._geometry = ImageGeometry(camera)
         self._misfit = TrackMisfit()
+        self.calibration = CalibrationDrift(camera)
         self._few = None if selects else FewFeatures()
         self._motions = TwoMotions(camera)
 
