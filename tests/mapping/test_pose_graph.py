@@ -670,7 +670,9 @@ def test_drift_by_way_of_a_loop_is_that_of_its_parts(tmp_path: Path, i: int) -> 
 
     def end(at: int, error: FloatArray) -> FloatArray:
         begin = motion(i, m, at, error) if i < m else se3_inverse(motion(m, i, at, error))
-        return begin @ loop.T_i_j @ se3_exp(error if at < 0 else 0 * error) @ motion(n, k, at, error)
+        return (
+            begin @ loop.T_i_j @ se3_exp(error if at < 0 else 0 * error) @ motion(n, k, at, error)
+        )
 
     expected = np.zeros((6, 6))
     P = np.diag(np.repeat([1e-4, 1e-5], 3)) ** 2
