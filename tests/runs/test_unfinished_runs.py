@@ -302,6 +302,7 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
     values |= {
         "integrity": "degraded",
         "tilt_sigma_rad": 0.01,
+        "position_doubt_m": 0.3,
         "stereo_field": field,
         "stereo_scale": scale,
     }
@@ -314,7 +315,7 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
             np.testing.assert_array_equal(getattr(read, part.name), getattr(given, part.name))
     bare = estimate_of(estimate_row(0, Estimate(0, np.eye(4), np.eye(6)))[0])
     assert [f.name for f in fields(Estimate) if getattr(bare, f.name) is not None] == [
-        *("time_ns", "T_world_imu", "covariance", "integrity", "findings")
+        *("time_ns", "T_world_imu", "covariance", "integrity", "findings", "position_doubt_m")
     ]
 
 
