@@ -142,10 +142,10 @@ def _drawn_halves(rigs: Sequence[str]) -> list[tuple[str, ...]]:
     rng = np.random.default_rng(0)
     drawn: dict[frozenset[int], tuple[str, ...]] = {}
     while len(drawn) < _MAX_SPLITS:
-        order = rng.permutation(len(rigs))
-        half, rest = order[: len(rigs) // 2], order[len(rigs) // 2 :]
-        of_split = frozenset((half if 0 in half else rest).tolist())
-        drawn.setdefault(of_split, tuple(rigs[k] for k in sorted(half.tolist())))
+        order = rng.permutation(len(rigs)).tolist()
+        half = order[: len(rigs) // 2]
+        has_first = half if 0 in half else order[len(half) :]
+        drawn.setdefault(frozenset(has_first), tuple(rigs[k] for k in sorted(half)))
     return list(drawn.values())
 
 
