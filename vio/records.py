@@ -644,6 +644,8 @@ class Estimate:
     # filter assumes.
     integrity: Integrity = "nominal"
     findings: tuple[str, ...] = ()  # codes of what makes it other than nominal
+    # standard deviation that findings add to the position, m, each axis: in the covariance already
+    position_doubt_m: float = field(default=0.0, metadata=_kept())
 
 
 def _no_ids() -> IntArray:

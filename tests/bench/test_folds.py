@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vio.bench.folds import cross_validate, fold_lines
+from vio.bench.folds import _splits, cross_validate, fold_lines
 from vio.bench.tables import Outcome
 from vio.cli import main
 from vio.errors import EvaluationError
@@ -59,6 +59,20 @@ def test_chance_alone_is_no_gain_in_the_mean() -> None:
         assert all(fold.ratio_chosen <= 1 for fold in result.folds)
         judged += [np.log(fold.ratio_judged) for fold in result.folds]
     assert abs(np.mean(judged)) < 3 * np.std(judged) / np.sqrt(len(judged))
+
+
+def test_of_too_many_splits_some_are_drawn_evenly() -> None:
+    """No pair of rigs is together in all of them, as in the first ones of a list."""
+    rigs = [f"r{k:02d}" for k in range(18)]
+    splits = list(_splits(rigs))
+    assert len({frozenset(half) for half, _ in splits}) == len(splits) == 2000
+    assert len({frozenset(half) for both in splits for half in both}) == 4000
+    assert all(sorted((*half, *rest)) == rigs for half, rest in splits)
+    together = [sum((rig in half) == (rigs[0] in half) for half, _ in splits) for rig in rigs[1:]]
+    assert np.mean(together) == pytest.approx(2000 * 8 / 17)
+    assert np.ptp(together) < 8 * np.sqrt(2000 / 4)
+    few = list(_splits(rigs[:6]))
+    assert len(few) == 10
 
 
 def test_each_rig_counts_once_however_many_drives_it_has() -> None:

@@ -350,6 +350,21 @@ def test_alignment_is_unobservable_without_rotation(
     assert str(found).endswith("not observable because the camera does not rotate")
 
 
+@pytest.mark.parametrize(("covered", "is_known"), [(0, False), (8, False), (37, False), (43, True)])
+def test_alignment_is_unobservable_where_samples_cover_few_frames(
+    samples: tuple[ImuSample, ...], spline: MotionSpline, covered: int, is_known: bool
+) -> None:
+    """Few told a time offset that was off by fifteen stated standard deviations, none told NaN."""
+    motion = _seen(spline)
+    end_ns = motion.times_ns[covered] + 110_000_000
+    begin_ns = motion.times_ns[0] - 110_000_000
+    few = tuple(s for s in samples if begin_ns < s.time_ns < end_ns)
+    found = align_gyro(motion, rates_of(few))
+    assert isinstance(found, ImuAlignment) == is_known
+    if not is_known:
+        assert "intervals between frames have samples of the sensor (40 needed)" in str(found)
+
+
 def test_rotation_about_one_axis_leaves_the_alignment_about_it_unobservable() -> None:
     rng = np.random.default_rng(0)
     times_ns = np.arange(0, 20_000_000_000, 50_000_000)

@@ -17,8 +17,8 @@ from vio.geometry.lie import (
     so3_exp,
     so3_log,
 )
-from vio.records import ImuDensities, ImuRecord, imu_matrices
-from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu, poses_by_known_lens
+from vio.records import ImuDensities, ImuRecord, IntArray, imu_matrices
+from vio.targets.inertial import BoardPoses, CameraImu, calibrate_imu
 
 DENSITIES = ImuDensities(gyro=2e-4, gyro_walk=1e-5, accel=2e-3, accel_walk=2e-4)
 T_CAM_IMU = se3_from_parts(so3_exp([0.3, -1.2, 0.4]), [0.03, -0.05, 0.02])
@@ -57,6 +57,14 @@ def hand_imu(seed: int, seconds: float, terms: FloatArray) -> ImuRecord:
         noise += white * root * rng.normal(size=values.shape)
         out.append((values + bias + noise) @ np.linalg.inv(M).T)
     return ImuRecord(np.round(1e9 * t).astype(np.int64), out[0], out[1])
+
+
+def poses_by_known_lens(
+    times_ns: IntArray, T_cam0_board: FloatArray, information: FloatArray
+) -> BoardPoses:
+    """Poses of a board whose lens is known."""
+    none = np.zeros((len(times_ns), 6, 0)), np.zeros((0, 0))
+    return BoardPoses(times_ns, T_cam0_board, information, *none)
 
 
 def _record(seed: int, seconds: float = 25.0, turning: float = 1.0) -> tuple[BoardPoses, ImuRecord]:

@@ -18,7 +18,7 @@ from vio.calibration import egomotion, gyro, lever_arm, readings, stereo, stereo
 from vio.calibration.egomotion import CameraMotion, camera_motion, stereo_twists
 from vio.calibration.findings import NotObservable
 from vio.calibration.inertial import ImuAlignment, Rates
-from vio.calibration.intrinsics import judge_intrinsics, judged_observable
+from vio.calibration.intrinsics import Intrinsics, judge_intrinsics, judged_observable
 from vio.calibration.lever_arm import LeverArm, estimate_lever_arm, judge_lever_arms
 from vio.calibration.pair_rotation import (
     is_turned_by_rows,
@@ -30,7 +30,7 @@ from vio.cameras.rectification_error import error_basis, vertical_disparity_term
 from vio.cameras.rig import Rig
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray, se3_exp, transform_points
-from vio.geometry.stereo import project
+from vio.geometry.stereo import StereoCamera, project
 from vio.records import (
     FIELD_TERMS,
     ROW_TERMS,
@@ -136,6 +136,15 @@ def _intrinsics(
     if isinstance(found, NotObservable):
         return None
     return [finding.fault for finding in judge_intrinsics(found)]
+
+
+def test_a_principal_point_is_off_in_rows_by_their_focal_length() -> None:
+    """Of pixels that are not square, each axis has its own."""
+    camera = StereoCamera(500.0, 250.0, 320.0, 120.0, 0.1, 640, 240)
+    found = judged_observable(camera, 0.0, 1e-3, (0.1, 0.1), (1e-3, 1e-3))
+    assert isinstance(found, Intrinsics)
+    np.testing.assert_allclose(found.centre_off_px, (50.0, 25.0))
+    assert found.centre_sigma_px[0] == pytest.approx(2 * found.centre_sigma_px[1])
 
 
 INTRINSICS: dict[str, tuple[Says, float, float]] = {

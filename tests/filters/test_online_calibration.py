@@ -249,7 +249,7 @@ def test_jacobian_of_the_cloned_camera_equals_central_differences() -> None:
     np.testing.assert_array_equal(noise, 0.0)
     for name in ("extrinsics", "time_offset"):
         column = online_calibration.BLOCKS[name].camera_D_error(
-            calibration, window.nav.T_world_imu, exposed, twist
+            window.nav.T_world_imu, exposed, twist
         )
         np.testing.assert_allclose(column, numeric[:, window.state.blocks[name]], atol=1e-6)
 

@@ -372,3 +372,14 @@ TABLES = {
 def test_priors_of_filters(says: Says, below: float, above: float) -> None:
     assert not says(below)
     assert says(above)
+
+
+def test_rows_are_off_by_focal_lengths_of_rows() -> None:
+    """Of pixels that are not square."""
+    camera = StereoCamera(800.0, 400.0, 320.0, 120.0, 0.1, 640, 240)
+    assert rig_calibration.rows_off(camera, 1.0) == 1.0 / 400.0
+    square = replace(camera, fu=400.0)
+    np.testing.assert_array_equal(
+        rig_calibration.field_sigmas(camera, 1.0, 1e-3),
+        rig_calibration.field_sigmas(square, 1.0, 1e-3),
+    )

@@ -21,6 +21,7 @@ import vio
 from tests.filters.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from vio.config import Config
 from vio.errors import ConfigError, DataError, EstimationError, VioError
+from vio.live import live_odometry
 from vio.live.build import MapUse, Parts
 from vio.live.figures import LiveMonitor
 from vio.live.live_odometry import LiveOdometry
@@ -328,6 +329,18 @@ def test_what_only_the_worker_can_refuse_is_counted_and_said() -> None:
     live.close()
     assert live.figures.refused == 1
     assert live.warnings == ("not these",)
+
+
+def test_of_frames_that_are_refused_for_hours_the_newest_lines_are_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(live_odometry, "_MAX_LINES", 3)
+    live = LiveOdometry(CAMERA, IMAGES_ALONE, parts=Parts(selector=Refusing()), drop="none")
+    for k in range(10):
+        live.add_observations(k * STEP_NS, [1], [[1, 2, 0, 2]])
+    live.close()
+    assert live.figures.refused == 10
+    assert live.warnings == ("not these",) * 3
 
 
 def test_reset_begins_a_new_trajectory() -> None:

@@ -36,6 +36,7 @@ from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import project_point
+from vio.imu.two_sensors import joined_record
 from vio.records import ImuSample, StereoFrame
 from vio.runs.live_folder import LiveRunSettings
 from vio.sources.oak import OakSource
@@ -351,6 +352,31 @@ def test_the_accelerometer_is_interpolated_at_the_times_of_the_gyro() -> None:
     for sample in out:
         np.testing.assert_allclose(sample.accel, [2.0 * sample.time_ns, 0.0, 1.0])
         np.testing.assert_array_equal(sample.gyro, float(sample.time_ns))
+
+
+def test_no_acceleration_is_made_up_in_a_gap_of_the_accelerometer() -> None:
+    """As where a gyro and an accelerometer of a file are joined."""
+    ms = 1_000_000
+    gyro = [5 * ms * k for k in range(400)]
+    accel = [8 * ms * k for k in range(250) if not 600 < 8 * k < 1100]
+    imu = ImuInterpolation()
+    events = sorted([(t, "gyro") for t in gyro] + [(t, "accel") for t in accel])
+    out = [s for t, kind in events for s in getattr(imu, kind)(t, np.full(3, 1e-9 * t))]
+    joined = joined_record(
+        *((np.array(t), np.repeat(1e-9 * np.array(t)[:, None], 3, axis=1)) for t in (gyro, accel))
+    )
+    assert joined is not None
+    assert [s.time_ns for s in out] == joined.times_ns.tolist()
+    np.testing.assert_allclose([s.accel for s in out], joined.accel)
+    assert not [t for t in joined.times_ns.tolist() if 600 * ms < t < 1100 * ms]
+
+
+def test_a_gyro_beside_a_silent_accelerometer_fills_no_memory() -> None:
+    imu = ImuInterpolation()
+    list(imu.accel(0, np.zeros(3)))
+    for k in range(10_000):
+        assert not list(imu.gyro(1 + k, np.zeros(3)))
+    assert len(imu._gyro) < 5000
 
 
 def test_a_realsense_made_by_its_library_gives_pairs_samples_and_calibration(

@@ -33,7 +33,7 @@ from vio.mapping.features import KeyframeFeatures
 from vio.mapping.loop_geometry import Verified, pose_of_most
 from vio.mapping.map_graph import MapGraph, _nearest
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
-from vio.mapping.place_finder import FoundPlace
+from vio.mapping.place_finder import FoundPlace, PlaceFinder
 from vio.mapping.pose_graph import (
     Edges,
     UpDirections,
@@ -648,6 +648,41 @@ def test_odometry_is_as_exact_in_a_later_session_as_in_the_first(tmp_path: Path)
     assert (np.linalg.eigvalsh(first) > 0).all()
     np.testing.assert_allclose(graph.drift(140 + i, 140 + k), first, rtol=1e-6, atol=1e-16)
     assert graph.path_m[159] == graph.path_m[19]
+
+
+@pytest.mark.parametrize("i", [2, 20], ids=["before the loop", "after it"])
+def test_drift_by_way_of_a_loop_is_that_of_its_parts(tmp_path: Path, i: int) -> None:
+    """By differences: errors of motions and of the loop, composed to a motion from i to k."""
+    m, n, k = 8, 50, 90
+    graph = _graph_of_sessions(tmp_path, 1, count=100)
+    T = graph.T_odom_cam
+    C_loop = np.diag([1e-4, 2e-4, 3e-4, 1e-5, 2e-5, 3e-5]) ** 2
+    loop = RelativePose(se3_inverse(T[m]) @ T[n], C_loop)
+    own: Any = SimpleNamespace(_graph=graph, newest=LoopRow(m, n, loop, 50, kept=True))
+    stated = PlaceFinder.drift_since(own, np.array([i]), k, systematic=0.0)[0]
+
+    def motion(first: int, last: int, at: int, error: FloatArray) -> FloatArray:
+        out = np.eye(4)
+        for row in range(first, last):
+            out = out @ se3_inverse(T[row]) @ T[row + 1]
+            out = out @ se3_exp(error) if row == at else out
+        return out
+
+    def end(at: int, error: FloatArray) -> FloatArray:
+        begin = motion(i, m, at, error) if i < m else se3_inverse(motion(m, i, at, error))
+        return (
+            begin @ loop.T_i_j @ se3_exp(error if at < 0 else 0 * error) @ motion(n, k, at, error)
+        )
+
+    expected = np.zeros((6, 6))
+    P = np.diag(np.repeat([1e-4, 1e-5], 3)) ** 2
+    steps = [*range(min(i, m), max(i, m)), *range(n, k)]
+    for at, C in [(-1, C_loop), *((row, P) for row in steps)]:
+        ends = [end(at, s * 1e-5 * e) for s in (1, -1) for e in np.eye(6)]
+        plus, minus = np.array(ends).reshape(2, 6, 4, 4)
+        J = se3_log(se3_inverse(minus) @ plus).T / 2e-5
+        expected += J @ C @ J.T
+    np.testing.assert_allclose(stated, expected, rtol=1e-3, atol=1e-12)
 
 
 def test_nothing_is_known_of_the_motion_between_sessions(tmp_path: Path) -> None:

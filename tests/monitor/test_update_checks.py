@@ -15,6 +15,7 @@ from vio.monitor.update_checks import UpdatedFrame
 from vio.records import (
     Estimate,
     Observations,
+    StereoFieldEstimate,
     StereoScaleEstimate,
     UpdateReport,
     observations,
@@ -125,6 +126,23 @@ def test_what_lasts_of_estimates_that_are_replaced_ends_with_them() -> None:
         (begun, *ends) = [f for f in monitor.findings if f.code == "no-features"]
         assert begun.lasts
         assert [(f.frame, f.ended) for f in ends] == ended * [(FRAMES, True)]
+
+
+def test_distorted_pixels_are_in_doubt_though_rows_that_differ_are_not_any_more() -> None:
+    """Both checks have one code; the end of the one that updates ask ended the other's, too."""
+    field = StereoFieldEstimate(np.zeros(8), np.eye(8), 30.0)
+    frames = [_updated(k) for k in range(FRAMES)]
+    off = [replace(f, estimate=replace(f.estimate, stereo_field=field)) for f in frames]
+    for distorted in (True, False):
+        monitor = RunMonitor(CAMERA, np.eye(4), imu=True)
+        if distorted:
+            monitor.add(Finding("other-calibration", "", 0, lasts=True))
+        _given(monitor, off)
+        assert "other-calibration" in {f.code for f in monitor.findings if f.frame == 0}
+        again = monitor.begun_again(FRAMES, ImuVerdict(usable=False), frames)
+        after = monitor.judged(FRAMES, _updated(FRAMES).estimate)
+        for estimate in (again[FRAMES - 1], after):
+            assert ("other-calibration" in estimate.findings) == distorted
 
 
 def test_a_restart_of_a_back_end_that_takes_all_again_is_reported() -> None:

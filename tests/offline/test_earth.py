@@ -651,3 +651,14 @@ def test_another_clock_of_a_precise_receiver_is_named(late_s: float) -> None:
 def test_errors_of_positions_are_no_other_clock(seed: int, jumps: Sequence[Jump]) -> None:
     drive = _drive(seed=seed, jumps=jumps)
     assert clock_doubt(drive.path, drive.fixes, LEVER_M, 0) is None
+
+
+def test_the_heading_of_a_tilted_map_is_as_uncertain_as_that_of_drawn_ones() -> None:
+    """As of images alone, of a rig that was rolled to its side: roll and yaw turn its x axis."""
+    rng = np.random.default_rng(5)
+    T = se3_exp([0.0, 0.0, 0.0, 0.3, -0.8, 0.5])
+    root = 0.004 * rng.normal(size=(6, 6))
+    stated = heading_deg(T, root @ root.T)[1]
+    drawn = T @ se3_exp(rng.normal(size=(4000, 6)) @ root.T)
+    headings = np.degrees(np.arctan2(drawn[:, 1, 0], drawn[:, 0, 0]))
+    assert stated == pytest.approx(headings.std(), rel=0.05)

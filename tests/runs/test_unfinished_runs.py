@@ -37,10 +37,18 @@ from vio.errors import DataError, EstimationError
 from vio.files.tables import KeptRows, Table
 from vio.files.trajectories import read_trajectory
 from vio.filters.msckf import Msckf
+from vio.findings import begun
+from vio.geometry.lie import se3_exp
 from vio.geometry.stereo import StereoCamera
-from vio.monitor.integrity import Mark
+from vio.monitor.integrity import IntegrityMonitor, Mark
 from vio.protocols import Dataset
-from vio.records import Estimate, Recording, StereoFieldEstimate, StereoScaleEstimate
+from vio.records import (
+    NS_PER_S,
+    Estimate,
+    Recording,
+    StereoFieldEstimate,
+    StereoScaleEstimate,
+)
 from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
 from vio.runs.folder import growing_folder
 from vio.runs.pipeline import RunControl, RunResult, run
@@ -294,6 +302,7 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
     values |= {
         "integrity": "degraded",
         "tilt_sigma_rad": 0.01,
+        "position_doubt_m": 0.3,
         "stereo_field": field,
         "stereo_scale": scale,
     }
@@ -306,7 +315,7 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
             np.testing.assert_array_equal(getattr(read, part.name), getattr(given, part.name))
     bare = estimate_of(estimate_row(0, Estimate(0, np.eye(4), np.eye(6)))[0])
     assert [f.name for f in fields(Estimate) if getattr(bare, f.name) is not None] == [
-        *("time_ns", "T_world_imu", "covariance", "integrity", "findings")
+        *("time_ns", "T_world_imu", "covariance", "integrity", "findings", "position_doubt_m")
     ]
 
 
@@ -840,6 +849,31 @@ def test_a_damaged_or_foreign_checkpoint_is_refused(
     path.write_bytes(spoil(path.read_bytes()))
     with pytest.raises(DataError, match="repeat the run from its start"):
         load_checkpoint(path, dataset)
+
+
+def test_smoothing_leaves_in_doubt_what_findings_doubt() -> None:
+    """Of the frame judged in doubt and of one marked later; smoothed, both were as exact as stated
+    by a filter that follows a fault.
+    """
+    recorder = RunRecorder("imu", lag_frames=2, keep_observations=False)
+    recorder._begin()
+    own = Estimate(0, np.eye(4), 1e-4 * np.eye(6))
+    monitor = IntegrityMonitor()
+    for k in range(4):
+        if k == 2:
+            monitor.take(begun("imu-disagrees", k, "", figures={"doubted_share": 1.0}))
+        at = replace(own, time_ns=k * NS_PER_S, T_world_imu=se3_exp([10.0 * k, 0, 0, 0, 0, 0]))
+        recorder._tables["estimates"].append(estimate_row(k, monitor.judged(k, at)))
+        recorder._tables["frames"].append(np.zeros(1, dtype=FRAME))
+    recorder.mark([Mark(2, 3, "degraded", "imu-disagrees", scale=0.1)])
+    before = recorder.estimates[2:]
+    assert [e.position_doubt_m for e in before] == pytest.approx([2.0, 10.0])
+    smoothed = replace(own, covariance=0.25e-4 * np.eye(6))
+    recorder.revise(lambda _: smoothed)
+    for was, now in zip(before, recorder.estimates[2:], strict=True):
+        added = np.diag([was.position_doubt_m**2] * 3 + [0.0] * 3)
+        np.testing.assert_allclose(now.covariance, smoothed.covariance + added)
+        assert now.integrity == "degraded"
 
 
 @pytest.mark.parametrize("effect", ["scale", "share"])

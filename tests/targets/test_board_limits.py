@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.board_views import GRID, LEFT, Flaws, made_views
+from tests.calibration.test_camera_imu import poses_by_known_lens
 from tests.refused import is_refused
 from vio.errors import DataError, VioError
 from vio.geometry.lie import FloatArray
@@ -248,7 +249,7 @@ def _first_offset_s(offset_s: float = 0.3, intervals: int = 40) -> float:
 def _problem(views: int = 30, step_s: float = 0.1) -> Any:
     """A board before a camera with an IMU, which stand."""
     times = np.round(1e9 * (1.0 + step_s * np.arange(views))).astype(np.int64)
-    poses = inertial.poses_by_known_lens(
+    poses = poses_by_known_lens(
         times, np.tile(np.eye(4), (views, 1, 1)), np.tile(np.eye(6), (views, 1, 1))
     )
     at = np.arange(0, times[-1] + 10**9, 10**7)

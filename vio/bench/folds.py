@@ -43,10 +43,9 @@ class CrossValidation:
 
     baseline: str  # the first configuration
     folds: tuple[Fold, Fold]
-    splits: int  # of the rigs into halves, each both ways: folds
-    better: (
-        float  # share of these folds whose winner is better than the baseline where it is judged
-    )
+    splits: int  # of the rigs into halves, each both ways: folds; all, or 2000 that are drawn
+    # share of these folds whose winner is better than the baseline where it is judged
+    better: float
     ratio_judged: float  # geometric mean over all folds
 
     @property
@@ -124,19 +123,30 @@ def _log_ratios(runs: Sequence[Outcome], systems: Sequence[str]) -> _LogRatios:
 
 
 def _splits(rigs: Sequence[str]) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Yield the splits into halves, each once, the first `_MAX_SPLITS`; of an odd number one half is
-    larger by one.
+    """Yield the splits into halves, each once; of more than `_MAX_SPLITS` so many, drawn. Of an odd
+    number one half is larger by one.
     """
     first, *others = rigs
-    count = 0
-    sizes = {len(rigs) // 2, len(rigs) - len(rigs) // 2}
-    for size in sorted(sizes):
-        for rest in combinations(others, size - 1):
-            half = (first, *rest)
-            yield half, tuple(rig for rig in rigs if rig not in half)
-            count += 1
-            if count == _MAX_SPLITS:
-                return
+    sizes = sorted({len(rigs) // 2, len(rigs) - len(rigs) // 2})
+    halves: Iterable[tuple[str, ...]]
+    if sum(math.comb(len(others), size - 1) for size in sizes) <= _MAX_SPLITS:
+        halves = ((first, *rest) for size in sizes for rest in combinations(others, size - 1))
+    else:
+        halves = _drawn_halves(rigs)
+    for half in halves:
+        yield half, tuple(rig for rig in rigs if rig not in half)
+
+
+def _drawn_halves(rigs: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return `_MAX_SPLITS` halves of rigs, no two of which are of one split."""
+    rng = np.random.default_rng(0)
+    drawn: dict[frozenset[int], tuple[str, ...]] = {}
+    while len(drawn) < _MAX_SPLITS:
+        order = rng.permutation(len(rigs)).tolist()
+        half = order[: len(rigs) // 2]
+        has_first = half if 0 in half else order[len(half) :]
+        drawn.setdefault(frozenset(has_first), tuple(rigs[k] for k in sorted(half)))
+    return list(drawn.values())
 
 
 def _both_ways(
@@ -176,6 +186,6 @@ def fold_lines(result: CrossValidation) -> Iterator[str]:
     verdict = "wins both ways" if result.wins else "does not win both ways"
     yield (
         f"ATE over that of {result.baseline}, geometric mean over rigs: the choice {verdict}. "
-        f"Over all {result.splits} splits into halves it is better where it was not chosen in "
+        f"Over {result.splits} splits into halves it is better where it was not chosen in "
         f"{share} % of the cases, {mean} in the mean."
     )

@@ -21,6 +21,7 @@ _BLOCKS: Tolerance[int] = 10  # of the jackknife
 class _FitRules:
     """How the rotation to the gyro and the time offset are fitted."""
 
+    min_intervals: int = 40  # between frames, with samples: fewer state too small deviations
     rotation_deg: float = 1.0  # standard deviation of the rotation beyond which it is called weak
     largest_offset_s: float = 0.1
     offset_step_s: Tolerance[float] = 0.004
@@ -41,11 +42,18 @@ def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservab
     `omega_cam dt = R_cam0_imu (integral of gyro over the shifted interval - b dt)`. Velocities of a
     `velocity` recording are used as directions, since a car rotates about one axis only.
     """
+    what = "IMU-camera rotation and time offset"
     if float(np.linalg.norm(motion.twists[:, 3:].std(axis=0))) < _MIN_RATE_RADPS:
-        return NotObservable("IMU-camera rotation and time offset", "the camera does not rotate")
+        return NotObservable(what, "the camera does not rotate")
     problem = _GyroProblem(motion, rates)
-    offset = problem.coarse_offset()
     keep = problem.covered
+    if (count := int(keep.sum())) < _FIT.min_intervals:
+        return NotObservable(
+            what,
+            f"only {count} intervals between frames have samples of the sensor "
+            f"({_FIT.min_intervals} needed); check that both have one clock",
+        )
+    offset = problem.coarse_offset()
     solution = problem.fit(problem.start(offset), keep)
     sigma = problem.spread(solution, keep)
     refits = []
@@ -72,7 +80,7 @@ def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservab
         time_offset_sigma_s=float(errors[3]),
         gyro_bias=solution[4:],
         residual_radps=sigma,
-        intervals=int(keep.sum()),
+        intervals=count,
         weak=weak,
     )
 

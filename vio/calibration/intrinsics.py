@@ -69,10 +69,10 @@ def judged_observable(
             f"the cameras turn too little: the standard deviations are {100 * sigma:.1f} % and "
             f"{camera.fu * max(across):.0f} px",
         )
-    u, v = (camera.fu * c for c in centre_off)
-    return Intrinsics(
-        camera.fu, focal_off, sigma, (u, v), (camera.fu * across[0], camera.fv * across[1])
-    )
+    focal_px = np.array([camera.fu, camera.fv])
+    off_u, off_v = (focal_px * centre_off).tolist()
+    sigma_u, sigma_v = (focal_px * across).tolist()
+    return Intrinsics(camera.fu, focal_off, sigma, (off_u, off_v), (sigma_u, sigma_v))
 
 
 def judge_intrinsics(found: Intrinsics | NotObservable) -> tuple[Finding, ...]:

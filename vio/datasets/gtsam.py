@@ -20,7 +20,7 @@ import numpy as np
 from vio.datasets.common import naming
 from vio.datasets.features import FeatureDataset
 from vio.datasets.reader import Reader
-from vio.datasets.settings import DatasetSettings
+from vio.datasets.settings import DatasetSettings, are_repeats_used
 from vio.datasets.tracks import refuse_swapped
 from vio.errors import CalibrationError, DataError
 from vio.files.stamps import ASSUMED_STEP_NS
@@ -87,7 +87,7 @@ def read_gtsam(path: Path, settings: DatasetSettings | None = None) -> FeatureDa
             "speeds are unknown",
             f"not used: the points X Y Z of {file.name}",
         ),
-        repeats_settled=settings is not None and settings.repeated_tracks == "literal",
+        repeats_settled=are_repeats_used(settings),
     )
     return FeatureDataset(recording, tracks, (), np.arange(len(numbers)))
 

@@ -26,7 +26,7 @@ from vio.datasets.features import FeatureDataset
 from vio.datasets.reader import Reader
 from vio.datasets.samples import MotionSamples
 from vio.datasets.samples import motion_samples as as_arrays
-from vio.datasets.settings import DatasetSettings
+from vio.datasets.settings import DatasetSettings, are_repeats_used
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_bytes
 from vio.files.stamps import FRAME_PACE, SAMPLE_PACE
@@ -315,7 +315,7 @@ def read_observation_log(path: Path, settings: DatasetSettings | None = None) ->
         landmarks_reference=_landmarks(arrays),
         notes=notes,
         run_motion=run_motion,
-        repeats_settled=settings is not None and settings.repeated_tracks == "literal",
+        repeats_settled=are_repeats_used(settings),
         image_numbers=arrays.get("image_numbers"),
     )
     return FeatureDataset(recording, tracks, motion, frames)

@@ -97,3 +97,8 @@ class DatasetSettings(Section):
     def cameras(self) -> int:
         """How many images of a stereo frame are decoded."""
         return 1 if self.camera == "left" else 2
+
+
+def are_repeats_used(settings: DatasetSettings | None) -> bool:
+    """Return whether features that repeat old pixels are to be used as they are."""
+    return settings is not None and settings.repeated_tracks == "literal"

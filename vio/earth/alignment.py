@@ -110,9 +110,13 @@ def heading_deg(T_enu_map: FloatArray, covariance: FloatArray) -> tuple[float, f
         covariance: (6, 6) of xi in T_enu_map exp(xi).
     """
     R = T_enu_map[:3, :3]
-    heading = np.arctan2(R[1, 0], R[0, 0])
+    east, north, up = R[:, 0].tolist()
+    heading = np.arctan2(north, east)
     P_world = R @ covariance[3:, 3:] @ R.T
-    sigma = np.sqrt(P_world[2, 2])
+    # of an axis that points upwards, a roll moves the heading as well
+    level = max(east**2 + north**2, 1e-12)
+    by_turn = np.array([-up * east / level, -up * north / level, 1.0])
+    sigma = np.sqrt(by_turn @ P_world @ by_turn)
     return float(np.degrees(heading)), float(np.degrees(sigma))
 
 

@@ -281,16 +281,11 @@ class CalibrationBlock:
         raise NotImplementedError
 
     def camera_D_error(
-        self,
-        calibration: Calibration,
-        T_world_imu: FloatArray,
-        T_exposed: FloatArray,
-        twist: Twist | None,
+        self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None
     ) -> FloatArray | None:
         """How its errors move the camera at an exposure (6, n), equation (C2); None: not.
 
         Args:
-            calibration: the present one.
             T_world_imu: the navigation state's pose (4, 4).
             T_exposed: the body's at the exposure (4, 4).
             twist: of the body; None while exposures do not follow the time offset's error.
@@ -413,11 +408,7 @@ class _ExtrinsicsBlock(CalibrationBlock):
         return se3_adjoint(T)
 
     def camera_D_error(
-        self,
-        calibration: Calibration,
-        T_world_imu: FloatArray,
-        T_exposed: FloatArray,
-        twist: Twist | None,
+        self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None
     ) -> FloatArray | None:
         return -se3_adjoint(T_exposed @ se3_inverse(T_world_imu))
 
@@ -447,11 +438,7 @@ class _TimeOffsetBlock(CalibrationBlock):
         return {"time_offset_s": calibration.time_offset_s, "time_offset_sigma_s": sigma}
 
     def camera_D_error(
-        self,
-        calibration: Calibration,
-        T_world_imu: FloatArray,
-        T_exposed: FloatArray,
-        twist: Twist | None,
+        self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None
     ) -> FloatArray | None:
         if twist is None:
             return None

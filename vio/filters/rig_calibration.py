@@ -58,7 +58,7 @@ def rows_off(camera: StereoCamera, offset_px: float) -> float:
     """Size of the rows' field in focal lengths: its root mean square, and what a saved
     calibration left.
     """
-    return float(np.hypot(offset_px, camera.residual_px)) / camera.fu
+    return float(np.hypot(offset_px, camera.residual_px)) / camera.fv
 
 
 def field_sigmas(camera: StereoCamera, offset_px: float, yaw_rad: float) -> FloatArray:
@@ -73,7 +73,7 @@ def field_sigmas(camera: StereoCamera, offset_px: float, yaw_rad: float) -> Floa
             _RIG.columns_by_rows * rows_off(camera, offset_px), MIN_FIELD_SIGMA, MAX_FIELD_SIGMA
         )
     )
-    return stereo_field_sigmas(sigma, yaw_rad, offset_px / camera.fu)
+    return stereo_field_sigmas(sigma, yaw_rad, offset_px / camera.fv)
 
 
 def constant_sigmas(settings: MsckfSettings) -> FloatArray:
@@ -180,7 +180,7 @@ class RigCalibration:
         moved_px = self._rows.moved_px
         if (
             "stereo_field" in window.state.blocks
-            and moved_px > _RIG.rows_moved_sigmas * _LEAST_ROWS * self.camera.fu
+            and moved_px > _RIG.rows_moved_sigmas * _LEAST_ROWS * self.camera.fv
         ):
             # A turn of which the rows show this part moves columns as much.
             sigmas = field_sigmas(self.camera, moved_px, stereo_yaw_rad(self.settings))

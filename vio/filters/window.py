@@ -345,7 +345,7 @@ class Window:
             exposed = T @ se3_exp(twist.mean * (calibration.time_offset_s - late_s))
         for name in calibration.estimated:
             seen = twist if compared else None
-            column = BLOCKS[name].camera_D_error(calibration, T, exposed, seen)
+            column = BLOCKS[name].camera_D_error(T, exposed, seen)
             if column is not None:
                 J[:, state.blocks[name]] = column
         return exposed, J

@@ -39,6 +39,8 @@ log = logging.getLogger(__name__)
 _LANDMARK_FRAMES: Capacity[int] = 100
 # estimates that wait for the reader; of a slower one, the oldest are forgotten
 _MAX_WAITING: Capacity[int] = 1000
+# lines that are kept of frames that were refused, and of a computer that falls behind: the newest
+_MAX_LINES: Capacity[int] = 1000
 
 
 class EstimateStream(Iterator[Estimate]):
@@ -197,7 +199,7 @@ class LiveOdometry(EventInputs[None]):
         self._points: deque[Landmarks] = deque()  # that do not change any more
         self._keep_landmarks = keep_landmarks
         self._copies = copy_images
-        self._lines: list[str] = []
+        self._lines: deque[str] = deque(maxlen=_MAX_LINES)
         self._worker = Worker(queue_frames, drop, finish=self._finish, close=self._let_go)
 
     def warm_up(self) -> None:

@@ -331,7 +331,8 @@ class Odometry(EventInputs["Estimate | None"]):
             return self._processor.pipeline.backend.take_landmarks()
 
     def smoothed(self, frame_index: int) -> Estimate | None:
-        """Return the estimate at a past frame with all frames since.
+        """Return the estimate at a past frame with all frames since, as the filter states it:
+        without integrity, and without what findings add to the covariance.
 
         None where the window no longer holds it.
         """

@@ -395,9 +395,11 @@ class PlaceFinder:
             np.array([n]), np.array([k]), systematic=systematic
         )
         there = graph.drift(i, np.full(len(i), m), systematic=systematic)
-        # The drift between i and m is known in the frame of the later one of them; its size is what
-        # matters here.
-        by_loop = there + here
+        T = graph.T_map_cam
+        B = se3_adjoint(
+            se3_inverse(T[k]) @ T[np.maximum(i, m)]
+        )  # `drift` is in the frame of the later
+        by_loop = B @ there @ np.swapaxes(B, 1, 2) + here
         shorter = np.trace(by_loop[:, :3, :3], axis1=1, axis2=2) < np.trace(
             direct[:, :3, :3], axis1=1, axis2=2
         )

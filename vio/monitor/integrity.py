@@ -253,7 +253,13 @@ class IntegrityMonitor:
         covariance = estimate.covariance
         if doubt_m > 0.0:
             covariance = inflated(covariance, doubt_m)
-        return replace(estimate, integrity=integrity, findings=codes, covariance=covariance)
+        return replace(
+            estimate,
+            integrity=integrity,
+            findings=codes,
+            covariance=covariance,
+            position_doubt_m=doubt_m,
+        )
 
     def _measure_doubt(self, now_ns: int, step_ns: int, held: list[Finding]) -> None:
         """Bring what the position may be off by to the present, a step after the last frame."""
@@ -384,6 +390,14 @@ def marked(estimate: Estimate, mark: Mark, sigma_m: float) -> Estimate:
     if mark.code is not None:
         codes = tuple(sorted({*codes, mark.code}))
     covariance = estimate.covariance
+    doubt_m = estimate.position_doubt_m
     if mark.share > 0.0 or mark.scale > 0.0:
         covariance = inflated(covariance, sigma_m)
-    return replace(estimate, integrity=integrity, findings=codes, covariance=covariance)
+        doubt_m = float(np.hypot(doubt_m, sigma_m))
+    return replace(
+        estimate,
+        integrity=integrity,
+        findings=codes,
+        covariance=covariance,
+        position_doubt_m=doubt_m,
+    )

@@ -298,9 +298,10 @@ class RunMonitor:
         self._scale_lines = []
         before = self._lasting
         self._lasting = set()
+        stand = {f.code for f in self._of_sensors() if f.lasts and _stays(f, verdict)}
         estimates = self._judged_again(frames, verdict)
         text = "that does not hold of the estimates that replace those before"
-        for code in sorted(before - self._lasting):
+        for code in sorted(before - self._lasting - stand):
             self._add([ended(code, index, text)])
         return estimates
 
@@ -311,7 +312,7 @@ class RunMonitor:
         what was found by the updates is found anew.
         """
         known = {finding.message for finding in self.findings}
-        stays = [f for k, f in enumerate(self.findings) if k not in self._of_updates]
+        stays = self._of_sensors()
         before = self._integrity
         self._integrity = IntegrityMonitor()
         estimates: dict[int, Estimate] = {}
@@ -328,6 +329,10 @@ class RunMonitor:
             estimates[index] = self._integrity.judged(index, frame.estimate)
         self._integrity.go_on_from(before, stays)
         return estimates
+
+    def _of_sensors(self) -> list[Finding]:
+        """Return what was found so far by images and samples, not by updates."""
+        return [f for k, f in enumerate(self.findings) if k not in self._of_updates]
 
     def goes_on_from(self, index: int, verdict: ImuVerdict) -> None:
         """Report that the run goes on from a frame with what is left of the IMU; what it has done to

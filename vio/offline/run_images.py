@@ -218,9 +218,10 @@ def field_coefficients(
     if stated is None or stated.get("rows_px") is None:
         return None
     try:
-        coefficients = (
-            np.array([*stated["coefficients_px"], *stated["rows_px"]], dtype=np.float64) / camera.fu
+        of_columns, of_rows = (
+            np.array(stated[name], dtype=np.float64) for name in ("coefficients_px", "rows_px")
         )
+        coefficients = np.concatenate([of_columns / camera.fu, of_rows / camera.fv])
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(
             f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run"

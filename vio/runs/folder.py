@@ -443,7 +443,8 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
     field = result.estimates[-1].stereo_field
     if field is None:
         return None
-    f = result.recording.camera.fu
+    camera = result.recording.camera
+    f = camera.fu
     found = None
     coefficients = f * field.coefficients
     sigmas = f * np.sqrt(np.diag(field.covariance))
@@ -469,7 +470,7 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
         "text": str(off),
         "coefficients_px": coefficients.tolist(),
         "sigma_px": sigmas.tolist(),
-        "rows_px": None if field.rows is None else (f * field.rows).tolist(),
+        "rows_px": None if field.rows is None else (camera.fv * field.rows).tolist(),
         "rig": rig,
     }
 

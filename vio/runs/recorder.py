@@ -27,7 +27,7 @@ from vio.files.tables import KeptRows, Records, Rows, Table, check_table
 from vio.files.trajectories import tum_text
 from vio.findings import INTEGRITIES
 from vio.geometry.lie import FloatArray
-from vio.monitor.integrity import Mark, marked
+from vio.monitor.integrity import Mark, inflated, marked
 from vio.numerics.kinds import Capacity
 from vio.protocols import Dataset
 from vio.records import (
@@ -186,7 +186,7 @@ class RunRecorder:
 
     def revise(self, smoothed: Smoothed, first: int = 0, end: int | None = None) -> None:
         """Replace estimates by the smoothed ones: pose, covariance, velocity and biases; without
-        a lag, nothing.
+        a lag, nothing. What findings leave in doubt stays so.
         """
         if not self._lag or not self._tables:
             return
@@ -196,10 +196,11 @@ class RunRecorder:
             row = estimates.rows()[k]
             late = smoothed(int(row["index"]))
             if late is not None:
+                was = estimate_of(row)
                 now = replace(
-                    estimate_of(row),
+                    was,
                     T_world_imu=late.T_world_imu,
-                    covariance=late.covariance,
+                    covariance=inflated(late.covariance, was.position_doubt_m),
                     velocity_world=late.velocity_world,
                     gyro_bias=late.gyro_bias,
                     accel_bias=late.accel_bias,

@@ -12,10 +12,13 @@ from typing import Literal, Protocol, TypeAlias
 from vio.cameras.rig import Rig
 from vio.errors import ConfigError
 from vio.geometry.lie import FloatArray
+from vio.imu.two_sensors import GAPS
+from vio.numerics.kinds import Capacity
 from vio.records import Image, ImuSample
 
 # without an image or sample, after which a device has gone
 LOST_S = 5.0
+_HELD_SAMPLES: Capacity[int] = 4000  # of a gyro beside a silent accelerometer: seconds
 
 Layout: TypeAlias = Literal["side-by-side", "top-bottom", "single"]
 # images beside and below one another in a picture
@@ -149,13 +152,14 @@ def open_source(name: str, layout: Layout = "side-by-side") -> LiveSource:
 class ImuInterpolation:
     """Holds samples of the gyro until the accelerometer has samples around them.
 
-    The accelerometer's readings are interpolated linearly; samples of the gyro before its first one
-    are left out.
+    The accelerometer's readings are interpolated linearly; samples of the gyro before its first one,
+    and in a gap of it, are left out, as where both are joined in a file (`vio.imu.two_sensors`).
     """
 
     def __init__(self) -> None:
-        self._gyro: deque[tuple[int, FloatArray]] = deque()
+        self._gyro: deque[tuple[int, FloatArray]] = deque(maxlen=_HELD_SAMPLES)
         self._accel: deque[tuple[int, FloatArray]] = deque()
+        self._accel_step_ns = 0  # the shortest so far
 
     def gyro(self, time_ns: int, value: FloatArray) -> Iterator[ImuSample]:
         """Take a sample (3,) rad/s of the gyro; yield what is complete."""
@@ -165,18 +169,22 @@ class ImuInterpolation:
 
     def accel(self, time_ns: int, value: FloatArray) -> Iterator[ImuSample]:
         """Take a sample (3,) m/s^2 of the accelerometer; yield what is complete."""
-        if not self._accel or time_ns > self._accel[-1][0]:
+        step_ns = time_ns - self._accel[-1][0] if self._accel else 0
+        if not self._accel or step_ns > 0:
             self._accel.append((time_ns, value))
+        if step_ns > 0:
+            self._accel_step_ns = min(step_ns, self._accel_step_ns or step_ns)
         yield from self._complete()
 
     def _complete(self) -> Iterator[ImuSample]:
+        longest_ns = max(GAPS.usual_intervals * self._accel_step_ns, GAPS.min_ns)
         while self._gyro and self._accel and self._gyro[0][0] <= self._accel[-1][0]:
             time_ns, gyro = self._gyro.popleft()
             while len(self._accel) > 1 and self._accel[1][0] <= time_ns:
                 self._accel.popleft()
             (t0, a0) = self._accel[0]
             (t1, a1) = self._accel[min(1, len(self._accel) - 1)]
-            if time_ns < t0:
+            if time_ns < t0 or t1 - t0 > longest_ns:
                 continue
             share = (time_ns - t0) / (t1 - t0) if t1 > t0 else 0.0
             yield ImuSample(time_ns, gyro, a0 + share * (a1 - a0))

@@ -109,15 +109,6 @@ class BoardPoses:
     lens_covariance: FloatArray  # (S, S) of those
 
 
-def poses_by_known_lens(
-    times_ns: IntArray, T_cam0_board: FloatArray, information: FloatArray
-) -> BoardPoses:
-    """Return poses of a board whose lens is known."""
-    return BoardPoses(
-        times_ns, T_cam0_board, information, np.zeros((len(times_ns), 6, 0)), np.zeros((0, 0))
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class CameraImu:
     """A camera and an IMU as calibrated."""
