@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from vio.cameras.rig import Rig
+from vio.datasets.common import image_size as checked_image_size
 from vio.datasets.common import naming, npz_names
 from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
 from vio.datasets.kitti_raw import (
@@ -144,6 +145,14 @@ def load_rig(
             impossible, the image size is neither stated nor given, or there is one camera of the
             two asked for; the message names file, entry and remedy.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise CalibrationError(
+            f"a calibration is named by one path, as text or pathlib.Path, not by {type(path).__name__}"
+        )
+    if cameras not in (None, 1, 2):
+        raise CalibrationError(f"cameras is {cameras!r}; give 1, 2 or None")
+    if image_size is not None:
+        image_size = _checked_size(image_size)
     file = Path(path)
     if not file.exists():
         seen_from = "" if file.is_absolute() else f" in {Path.cwd()}"
@@ -161,6 +170,16 @@ def load_rig(
             "its pose (Kalibr)"
         )
     return rig.left_alone() if cameras == 1 else rig
+
+
+def _checked_size(size: Size) -> Size:
+    """Return the width and the height that a caller gives, as whole numbers."""
+    values = np.asarray(size)
+    if values.shape != (2,) or values.dtype.kind not in "iuf":
+        raise CalibrationError(
+            f"image_size is {size!r}; give the width and the height of the images, as (1280, 720)"
+        )
+    return checked_image_size(values.tolist(), "image_size")
 
 
 def find_calibration(folder: Path) -> Path | None:
