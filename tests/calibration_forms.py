@@ -438,6 +438,77 @@ def zed(folder: Path) -> Path:
     return folder
 
 
+def mrpt(folder: Path) -> Path:
+    """With the comments that its tool writes."""
+    rig = true_rig()
+    text = "# Left camera calibration parameters:\n"
+    for side, c in zip(("LEFT", "RIGHT"), rig.cameras, strict=True):
+        text += f"[CAMERA_PARAMS_{side}]\nresolution = [{c.width} {c.height}]\n"
+        for key, value in zip(("fx", "fy", "cx", "cy"), _intrinsics(c), strict=True):
+            text += f"{key} = {value}  // +/- 0.1\n"
+        bend = " ".join(map(repr, (*c.coefficients, 0.0)))
+        text += f"dist = [{bend}]    // The order is: [K1 K2 T1 T2 K3]\n"
+    T = se3_inverse(T_CAM1_CAM0)
+    x, y, z, w = quat_xyzw_from_rotation(T[:3, :3]).tolist()
+    pose = " ".join(map(repr, (*T[:3, 3].tolist(), w, x, y, z)))
+    text += f"[CAMERA_PARAMS_LEFT2RIGHT_POSE]\npose_quaternion = [{pose}]\n"
+    return _save(folder, "calib.ini", text)
+
+
+def mrpt_text(folder: Path) -> Path:
+    """As the Malaga sets name it."""
+    return mrpt(folder).rename(folder / "camera_params_raw_1280x720.txt")
+
+
+def dsec(folder: Path) -> Path:
+    """Of four cameras, those of images in the middle; R_rect of each maps to its rectified one."""
+    camera, other = rectified_rig().cameras
+    turns = [se3_exp([0, 0, 0, 0.01, -0.02, 0.03]), se3_exp([0, 0, 0, -0.02, 0.01, 0.01])]
+    T_21 = se3_inverse(turns[1]) @ rectified_rig().right[1] @ turns[0]
+    stated = {
+        name: {"camera_matrix": list(_intrinsics(c)), "resolution": list(SIZE)}
+        for name, c in (("camRect0", other), ("camRect1", camera), ("camRect2", other))
+    }
+    stated["cam0"] = {"camera_matrix": [555.0, 555.0, 340.0, 215.0], "resolution": [640, 480]}
+    poses = {"T_10": np.eye(4), "T_21": T_21} | {
+        f"R_rect{k}": T[:3, :3] for k, T in enumerate(turns, start=1)
+    }
+    data = {"intrinsics": stated, "extrinsics": {key: T.tolist() for key, T in poses.items()}}
+    return _save(folder, "cam_to_cam.yaml", yaml.safe_dump(data))
+
+
+def driving_stereo(folder: Path) -> Path:
+    """Of half images: the last column of P_rect_103 is that of whole ones."""
+    c = rectified_rig().cam0
+    poses = (se3_exp([0, 0, 0, 0.01, -0.02, 0.03]), se3_exp([0, 0, 0, -0.02, 0.01, 0.01]))
+    poses = (poses[0], poses[1] @ rectified_rig().right[1] @ poses[0])
+    text = "calib_time: 2018-07-09\n"
+    for name, T, column in zip(("101", "103"), poses, (0.0, -2 * 0.11 * c.fu), strict=True):
+        P = [c.fu, 0, c.cu, column, 0, c.fv, c.cv, 0, 0, 0, 1, 0]
+        rows = {
+            "S": (1762, 800), "K": (c.fu, 0, c.cu, 0, c.fv, c.cv, 0, 0, 1), "D": (-0.3, 0.1, 0, 0, 0),
+            "R": T[:3, :3].ravel(), "T": T[:3, 3], "S_rect": SIZE, "P_rect": P,
+        }  # fmt: skip
+        for key, values in rows.items():
+            text += f"{key}_{name}: {' '.join(repr(float(x)) for x in values)}\n"
+    return _save(folder, "2018-07-09-16-11-56.txt", text)
+
+
+def virtual_kitti(folder: Path) -> Path:
+    """Its size is not stated; all frames have one rig."""
+    lenses = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]\n"
+    poses = "frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1\n"
+    rig = rectified_rig()
+    T_cam0_world = se3_exp([1.0, -2.0, 3.0, 0.1, -0.2, 0.3])
+    for frame in range(2):
+        for k, c in enumerate(rig.cameras):
+            T = (rig.right[1] if k else np.eye(4)) @ T_cam0_world
+            lenses += f"{frame} {k} {' '.join(map(repr, _intrinsics(c)))}\n"
+            poses += f"{frame} {k} {' '.join(map(repr, T.ravel().tolist()))}\n"
+    _save(folder, "extrinsic.txt", poses)
+    return _save(folder, "intrinsic.txt", lenses)
+
+
 def okvis(folder: Path) -> Path:
     """The time shift has the opposite sign of Kalibr's."""
     rig = true_rig()
@@ -893,6 +964,11 @@ FORMS = (
     Form("ZED", "`SN*.conf`", zed, imu_free(true_rig()), SIZE),
     Form("ZED", "`SN*.conf` with `LEFT_DISTO`, fisheye", zed_x, imu_free(true_rig("equidistant")), SIZE, row=False),
     Form("ZED", "`SN*.conf`, images of another size", zed, None, (640, 480)),
+    Form("MRPT", "`calib.ini`", mrpt, imu_free(true_rig()), row=False),
+    Form("MRPT", "`camera_params_raw_*.txt` of Malaga", mrpt_text, imu_free(true_rig()), row=False),
+    Form("DSEC", "`cam_to_cam.yaml`", dsec, imu_free(rectified_rig()), row=False),
+    Form("DrivingStereo", "`half-image-calib`", driving_stereo, imu_free(rectified_rig()), row=False),
+    Form("Virtual KITTI", "`intrinsic.txt`", virtual_kitti, imu_free(rectified_rig()), SIZE, row=False),
     Form("OKVIS, OKVIS2", "`cameras:` with `T_SC`", okvis, true_rig()),
     Form("OKVIS2", "likewise, `cam_model: eucm`", okvis2_eucm, true_rig("eucm"), row=False),
     Form("maplab, SVO", "`cameras:` with `T_B_C`", ncamera, true_rig()),

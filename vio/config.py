@@ -158,7 +158,7 @@ def merge_override(section: _Section, override: str, *, example: str) -> _Sectio
         ConfigError: the text is no such pair (the message gives the example), or a key or value is
             wrong.
     """
-    key, equals, text = override.partition("=")
+    key, equals, text = override.partition("=") if isinstance(override, str) else ("", "", "")
     if not equals or not key.strip():
         raise ConfigError(f"--set takes key=value, got '{override}'; for example --set {example}")
     try:

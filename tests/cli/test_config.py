@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -126,6 +127,12 @@ def test_empty_file_changes_nothing(tmp_path: Path) -> None:
 def test_reports_mistakes_in_the_file(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_config(_write(tmp_path, text))
+
+
+def test_names_what_is_no_text_among_overrides() -> None:
+    nothing: Any = None
+    with pytest.raises(ConfigError, match="--set takes key=value, got 'None'"):
+        load_config(overrides=[nothing])
 
 
 @pytest.mark.parametrize(("digits", "size"), [("010", 10), ("0x10", 16), ("+1_0", 10)])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.commands import refused
+from tests.plain_maker import make_plain
 from vio.cli import main
 from vio.datasets import open_dataset
 from vio.datasets.settings import DatasetSettings
@@ -54,12 +55,26 @@ def test_results_are_no_recording(run: Path, capsys: pytest.CaptureFixture[str])
 
 
 def test_what_takes_the_place_of_another_thing_is_named(
-    flight: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    flight: Path,
+    run: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     table = flight / "mav0" / "imu0" / "data.csv"
     (tmp_path / "yard.map").write_bytes(b"SQLite format 3\0")
     message = f"{flight} is a recording, and {run} a run: name the run first"
     assert message in refused(capsys, "eval", flight, run)
+    truth = tmp_path / "truth.tum"
+    shutil.copy(run / "trajectory.tum", truth)
+    for reference in (run, run / "trajectory.tum"):
+        assert main(["eval", str(truth), str(reference)]) == 0
+        assert "the estimate goes first" in caplog.text
+        caplog.clear()
+    capsys.readouterr()
+    for estimate, reference in ((run, truth), (run, run)):
+        assert main(["eval", str(estimate), str(reference)]) == 0
+        assert "the estimate goes first" not in caplog.text
     assert "the page is HTML; name it page.html" in refused(
         capsys, "report", run, "--out", tmp_path / "page.pdf"
     )
@@ -157,3 +172,13 @@ def test_an_euroc_folder_of_one_camera_takes_its_times_from_its_list(
     listed.write_text("\n".join(listed.read_text().splitlines()[:-1]) + "\n")
     with pytest.raises(DataError, match=r"data\.csv: does not list .*\.png"):
         open_dataset(tmp_path / "flight")
+
+
+def test_image_folders_of_trees_of_their_own_are_parts_of_a_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As Sintel's final_left/alley_1 and final_right/alley_1, Cityscapes' and DSEC's."""
+    make_plain(tmp_path / "sintel", folders=("final_left/alley_1", "final_right/alley_1"))
+    part = tmp_path / "sintel" / "final_right" / "alley_1"
+    message = refused(capsys, "inspect", part)
+    assert f"is a part of the recording {tmp_path / 'sintel'}; give that folder" in message

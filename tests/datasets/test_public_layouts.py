@@ -210,3 +210,28 @@ def test_a_principal_point_of_exchanged_numbers_is_refused(
         else:
             with pytest.raises(CalibrationError, match=said):
                 make()
+
+
+def test_a_rendered_drive_has_its_views_beside_depths_and_its_truth(tmp_path: Path) -> None:
+    """As Virtual KITTI 2: frames/rgb/Camera_0 beside frames/depth/Camera_0, 4 by 4 to the cameras."""
+    folders = ("frames/rgb/Camera_0", "frames/rgb/Camera_1")
+    make_plain(tmp_path, 3, folders=folders, calibration=False, imu=False, reference=False)
+    for kind in ("depth", "classSegmentation"):
+        shutil.copytree(tmp_path / "frames" / "rgb", tmp_path / "frames" / kind)
+    lenses = ["frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"]
+    poses = ["frame cameraID r1,1 r1,2 r1,3 t1 r2,1 r2,2 r2,3 t2 r3,1 r3,2 r3,3 t3 0 0 0 1"]
+    for frame in range(3):
+        for camera in range(2):
+            lenses.append(f"{frame} {camera} 60 60 32 24")
+            shift = -2.0 * frame  # of the world, as the camera drives forward
+            poses.append(f"{frame} {camera} 1 0 0 {-0.5 * camera} 0 1 0 0 0 0 1 {shift} 0 0 0 1")
+    (tmp_path / "intrinsic.txt").write_text("\n".join(lenses) + "\n")
+    (tmp_path / "extrinsic.txt").write_text("\n".join(poses) + "\n")
+    recording = open_dataset(tmp_path).recording
+    assert recording.camera.baseline_m == pytest.approx(0.5)
+    assert recording.reference is not None
+    np.testing.assert_allclose(recording.reference.positions, [[0, 0, 0], [0, 0, 2], [0, 0, 4]])
+    assert not any("extrinsic" in note for note in recording.notes)
+    last = len(poses) - 2
+    (tmp_path / "extrinsic.txt").write_text("\n".join(poses[:last]) + "\n")
+    assert len(open_dataset(tmp_path).recording.reference or ()) == 2

@@ -4,10 +4,12 @@ people have.
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -925,3 +927,26 @@ def test_real_calibrations(name: str, baseline_m: float, imu: bool, data_dir: Pa
     assert rig.camera.baseline_m == pytest.approx(baseline_m, abs=1e-5)
     assert (rig.T_cam0_imu is not None) == imu
     assert (rig.imu_noise is not None) == imu
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"path": None}, "named by one path, as text or pathlib.Path, not by NoneType"),
+        ({"image_size": (375, 1242, 3)}, "give the width and the height of the images, as"),
+        ({"image_size": 1242}, "give the width and the height of the images, as"),
+        ({"cameras": "2"}, "cameras is '2'; give 1, 2 or None"),
+    ],
+)
+def test_names_what_a_call_gives_in_the_place_of_an_argument(
+    tmp_path: Path, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(CalibrationError, match=re.escape(message)):
+        vio.load_rig(**{"path": tmp_path, **arguments})
+
+
+def test_names_a_rotation_and_a_translation_in_the_place_of_one_matrix() -> None:
+    K = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
+    pair: Any = (np.eye(3), [-0.1, 0, 0])
+    with pytest.raises(CalibrationError, match=r"T_cam1_cam0: .*give one matrix \[R t\]"):
+        vio.Rig.raw(K, K, pair, 640, 480)

@@ -55,7 +55,7 @@ BY_PURPOSE = {
 }
 # What is typed in the place of a command or an option, and would be taken for one spelt alike.
 _MEANT = {
-    **dict.fromkeys(("compare", "diff", "ape", "rpe", "ate", "traj"), "eval"),
+    **dict.fromkeys(("compare", "diff", "ape", "rpe", "ate", "traj", "evaluate"), "eval"),
     **dict.fromkeys(("plot", "html"), "report"),
     **dict.fromkeys(("show", "viz", "visualize", "visualise"), "view"),
     **dict.fromkeys(("slam", "odometry", "odom", "track", "process"), "run"),

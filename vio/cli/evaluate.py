@@ -134,6 +134,11 @@ def columns(text: str) -> tuple[str, ...]:
 def execute(args: argparse.Namespace) -> int:
     _check_plot(args)
     estimates = {path: _read(path, args.reference) for path in args.estimates}
+    if _is_of_run(args.reference) and not any(map(_is_of_run, args.estimates)):
+        log.warning(
+            "%s, a run, is taken for the reference as it is named last; the estimate goes first",
+            args.reference,
+        )
     reference = _read(args.reference)
     results = {
         str(path): _evaluated(args, estimate, _numbered(path, reference))
@@ -351,6 +356,13 @@ def _read(path: Path, compared_with: Path | None = None) -> tuple[Trajectory, Fl
             )
         return truth
     return read_run(path)
+
+
+def _is_of_run(path: Path) -> bool:
+    """Return whether a path is a run's folder, or a file in one."""
+    from vio.runs.files import RunFile
+
+    return any((folder / RunFile.METRICS).is_file() for folder in (path, path.parent))
 
 
 def _truth_of(path: Path) -> tuple[Trajectory, FloatArray | None]:

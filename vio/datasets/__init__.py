@@ -43,7 +43,6 @@ _OF_NUMBERS = (".npy", ".csv", ".tsv", ".txt", ".json", ".jsonl", ".pkl", ".pick
 _MAX_LOOKED_AT = 200  # of what a folder holds that is no recording itself
 _MAX_NAMED = 3  # of the recordings in it
 _LEVELS_ABOVE = 3  # folders in which a file of a recording may lie
-_INNER = ("data", "data_rect")  # folders of images in that of a camera
 _DEMO = Path("demo/street")  # that the documentation's examples read
 
 
@@ -268,8 +267,7 @@ def _home_of(given: Path, layout: Layout) -> Path | None:
     """Return the folder of a recording, of which a path is a camera's or an IMU's, or a file beside
     those; None: it is something else there.
     """
-    own = layout.left.parent
-    home = own.parent if layout.left.name in _INNER else own
+    home = Path(os.path.commonpath([layout.left, layout.right]))
     if home not in given.parents:
         return None
     within = given.relative_to(home).parts

@@ -22,6 +22,8 @@ from vio.datasets.kitti import read_extrinsics
 from vio.datasets.rigs.eth3d import EXTRINSICS, FOLDERS, is_eth3d, truth_of_left
 from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transform
 from vio.datasets.rigs.plausible import noting_imu_place
+from vio.datasets.rigs.virtual_kitti import EXTRINSICS as EXTRINSICS_OF_VIRTUAL_KITTI
+from vio.datasets.rigs.virtual_kitti import poses_of_left
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import (
@@ -419,9 +421,11 @@ def _read_reference(
     layout = images.layout
     bases = (layout.root, layout.base, layout.root / "dso")
     file = next((f for n in _REFERENCES for base in bases if (f := base / n).is_file()), None)
-    if file is None:
+    truth = poses_of_left(layout.root) if file is None else read_trajectory(file)
+    if truth is None:
         return None, None
-    truth = read_trajectory(file)
+    if file is None:
+        file = layout.root / EXTRINSICS_OF_VIRTUAL_KITTI
     if truth.times_ns is None:
         truth = reference_of_images(truth, images.times[0], images.numbers, file)
     if is_pair_of_eth3d(layout):

@@ -24,6 +24,7 @@ PERSPECTIVE = "perspective.txt"  # of KITTI-360, in the same form
 VELO = "calib_velo_to_cam.txt"
 IMU = "calib_imu_to_velo.txt"
 _MAX_PARENTS = 3
+_DRIVING_STEREO = ("101", "103")  # its left and its right camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +96,34 @@ def read_perspective(path: Path) -> tuple[CameraModel, CameraModel, FloatArray]:
         cameras.append(_camera(P[:, :3], size, (), f"{path}, P_rect_{k}"))
         offsets.append(np.linalg.solve(P[:, :3], P[:, 3]))
     return cameras[0], cameras[1], se3_from_parts(np.eye(3), offsets[1] - offsets[0])
+
+
+def is_driving_stereo(path: Path) -> bool:
+    """Return whether a text file has DrivingStereo's cameras, numbered 101 and 103."""
+    return any(line.startswith(f"P_rect_{_DRIVING_STEREO[0]}:") for _, line in text_lines(path))
+
+
+def read_driving_stereo(path: Path) -> tuple[CameraModel, CameraModel, FloatArray]:
+    """Return DrivingStereo's rectified cameras and `T_rect1_rect0` (4, 4), whose published images are
+    rectified.
+
+    The baseline is that of the raw cameras, `R_101 T_101 R_103 T_103`, as the last column of `P_rect_103`
+    is that of whole images in the files of half ones too.
+    Reference: Yang et al., DrivingStereo (2019), and public reports of its half-size calibrations.
+
+    Raises:
+        CalibrationError: an entry is missing, malformed or impossible.
+    """
+    entries = _read_entries(path)
+    cameras = []
+    poses = []
+    for k in _DRIVING_STEREO:
+        size = _size(entries, f"S_rect_{k}", path)
+        P = _entry(entries, f"P_rect_{k}", 12, path).reshape(3, 4)
+        cameras.append(_camera(P[:, :3], size, (), f"{path}, P_rect_{k}"))
+        poses.append(_transform(entries, path, f"R_{k}", f"T_{k}"))
+    baseline_m = float(np.linalg.norm((poses[1] @ se3_inverse(poses[0]))[:3, 3]))
+    return cameras[0], cameras[1], se3_from_parts(np.eye(3), [-baseline_m, 0.0, 0.0])
 
 
 def _camera(

@@ -62,7 +62,7 @@ from vio.datasets.rigs.eth3d import FOLDERS as ETH3D_FOLDERS
 from vio.datasets.rigs.eth3d import is_eth3d
 from vio.datasets.rigs.names import named_calibration
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.sides import first_pair, pairs_of, split_sides, stamped_sides
+from vio.datasets.sides import first_pair, pairs_of, split_sides, stamped_sides, words_of
 from vio.datasets.tables import drive_times
 from vio.datasets.tum_rgbd import (
     DEPTH_FACTOR,
@@ -92,6 +92,11 @@ ALONE = (
 _GRAY = (0, 1)  # of KITTI
 _COLOUR = (2, 3)
 _INSIDE = ("data", "images", "")
+# words of folders of images that show no view, beside those that do (Virtual KITTI, TartanAir, Isaac)
+_OTHER_THAN_VIEWS = frozenset((
+    "depth", "depths", "disparity", "disparities", "disp", "flow", "instance", "label", "labels",
+    "mask", "masks", "normal", "normals", "seg", "segmentation", "semantic", "semantics",
+))  # fmt: skip
 
 
 class _FolderRules(NamedTuple):
@@ -141,8 +146,8 @@ def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
     if known is not None:
         return known
     names = [str(folder) for folder in image_folders(path)]
-    pairs = pairs_of(names)
-    pair = first_pair(pairs)
+    views = [name for name in names if not _OTHER_THAN_VIEWS.intersection(words_of(name))]
+    pair = first_pair(pairs_of(views)) or first_pair(pairs_of(names))
     if pair is None:
         return None
     left, right = (path / name for name in pair)

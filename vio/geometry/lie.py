@@ -444,7 +444,12 @@ def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
     Raises:
         CalibrationError: entries are not finite, or the rotation part is not a rotation.
     """
-    T_ = np.asarray(T, dtype=np.float64)
+    try:
+        T_ = np.asarray(T, dtype=np.float64)
+    except (TypeError, ValueError) as error:  # as of a pair (R, t)
+        raise CalibrationError(
+            f"{where}: not a 3x4 or 4x4 transform ({error}); give one matrix [R t]"
+        ) from error
     if T_.shape not in ((3, 4), (4, 4)) or not np.isfinite(T_).all():
         raise CalibrationError(
             f"{where}: not a finite 3x4 or 4x4 transform (shape {T_.shape}); check the calibration"

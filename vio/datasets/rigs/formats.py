@@ -13,12 +13,15 @@ from typing import Literal
 import numpy as np
 
 from vio.cameras.rig import Rig
+from vio.datasets.common import image_size as checked_image_size
 from vio.datasets.common import naming, npz_names
 from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
 from vio.datasets.kitti_raw import (
     CAMERAS,
     PERSPECTIVE,
+    is_driving_stereo,
     read_cam_to_cam,
+    read_driving_stereo,
     read_imu_pose,
     read_perspective,
 )
@@ -29,10 +32,12 @@ from vio.datasets.rigs import (
     boofcv,
     camodocal,
     depthai,
+    dsec,
     edex,
     eth3d,
     matlab,
     monado,
+    mrpt,
     okvis,
     orbslam,
     spectacular,
@@ -60,6 +65,7 @@ from vio.datasets.rigs.opencv import (
 )
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import Source, stereo_pose_on_imu
+from vio.datasets.rigs.virtual_kitti import is_virtual_kitti, read_virtual_kitti
 from vio.datasets.sides import side_word
 from vio.datasets.yaml_files import Entries, read_json_file
 from vio.errors import CalibrationError, DataError
@@ -77,12 +83,13 @@ KNOWN = (
     "VINS, OKVIS, Kimera or SVO, Basalt's, Monado's, DepthAI's or Spectacular AI's JSON, cuVSLAM's EDEX, or a "
     "ZED's SN*.conf"
 )
+_INI = (".conf", ".ini")
 _OTHERS = (
     ".yaml",
     ".yml",
     ".json",
     ".xml",
-    ".conf",
+    *_INI,
     ".npz",
     edex.SUFFIX,
     matlab.SUFFIX,
@@ -114,6 +121,8 @@ _FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] 
     (basalt.matches, basalt.read),
     (depthai.matches, depthai.read),
     (zed.matches, zed.read),
+    (mrpt.matches, mrpt.read),
+    (dsec.matches, dsec.read),
     (matlab.matches, matlab.read),
     (lambda entries: _NAMED in entries, lambda source: _openvins(source)),
     (lambda entries: _is_sensor_sheet(entries), lambda source: _euroc(source)),
@@ -144,6 +153,14 @@ def load_rig(
             impossible, the image size is neither stated nor given, or there is one camera of the
             two asked for; the message names file, entry and remedy.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise CalibrationError(
+            f"a calibration is named by one path, as text or pathlib.Path, not by {type(path).__name__}"
+        )
+    if cameras not in (None, 1, 2):
+        raise CalibrationError(f"cameras is {cameras!r}; give 1, 2 or None")
+    if image_size is not None:
+        image_size = _checked_size(image_size)
     file = Path(path)
     if not file.exists():
         seen_from = "" if file.is_absolute() else f" in {Path.cwd()}"
@@ -161,6 +178,16 @@ def load_rig(
             "its pose (Kalibr)"
         )
     return rig.left_alone() if cameras == 1 else rig
+
+
+def _checked_size(size: Size) -> Size:
+    """Return the width and the height that a caller gives, as whole numbers."""
+    values = np.asarray(size)
+    if values.shape != (2,) or values.dtype.kind not in "iuf":
+        raise CalibrationError(
+            f"image_size is {size!r}; give the width and the height of the images, as (1280, 720)"
+        )
+    return checked_image_size(values.tolist(), "image_size")
 
 
 def find_calibration(folder: Path) -> Path | None:
@@ -220,7 +247,7 @@ def _entries(path: Path) -> Entries:
         return read_arrays(path)
     if suffix == matlab.SUFFIX:
         return matlab.read_mat(path)
-    if suffix == ".conf" and not path.read_bytes().startswith(b"%YAML"):
+    if suffix in (*_INI, ".txt") and not path.read_bytes().startswith(b"%YAML"):
         return zed.read_conf(path)
     if suffix == ".xml":
         return {} if is_boofcv(path) else read_entries(path)
@@ -239,7 +266,7 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
         return read_four_seasons(path, image_size)
     if path.name == eth3d.EXTRINSICS:
         return eth3d.read_eth3d(path, image_size)
-    if suffix == ".txt":
+    if suffix == ".txt" and not mrpt.is_mrpt(path):
         return _read_txt(path, image_size)
     if suffix == ".xml" and is_boofcv(path):
         return read_boofcv(path)
@@ -276,6 +303,12 @@ def _report_of(path: Path) -> str:
 def _read_txt(path: Path, image_size: Size | None) -> Rig:
     if what := _report_of(path):
         raise CalibrationError(f"{path}: is {what}")
+    if is_virtual_kitti(path):
+        return read_virtual_kitti(path, image_size)
+    if is_driving_stereo(path):
+        rect0, rect1, T_rect1_rect0 = read_driving_stereo(path)
+        with naming(path):
+            return checked_rig(Rig(rect0, rect1, T_rect1_rect0), path)
     if bare.is_bare(path):
         return bare.read_bare(path, image_size)
     rig = read_middlebury(path, image_size)
