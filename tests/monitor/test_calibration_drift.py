@@ -108,6 +108,18 @@ def test_terms_that_move_enlarge_what_is_stated_now() -> None:
     assert found.share == pytest.approx(factor * now * np.linalg.norm(by_field))
 
 
+def test_a_back_end_that_holds_terms_constant_is_judged_by_the_others() -> None:
+    covariance = np.zeros((FIELD_TERMS, FIELD_TERMS))
+    check = CalibrationDrift(CAMERA)
+    for k in range(40):
+        yaw = 0.0 if k < 30 else 0.01
+        covariance[0, 0] = (PRIOR_SIGMA if k == 0 else KNOWN_SIGMA) ** 2
+        field = StereoFieldEstimate(constant_yaw(yaw), covariance.copy())
+        given = replace(estimate(k, constant_yaw(yaw), KNOWN_SIGMA), stereo_field=field)
+        share = check.frame(seen(k), given).share
+        assert (share > 0.4) == (k >= 30)  # of 0.5
+
+
 def test_without_right_pixels_or_a_field_nothing_is_judged() -> None:
     check = CalibrationDrift(CAMERA)
     for k in range(60):

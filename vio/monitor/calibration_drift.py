@@ -32,7 +32,7 @@ from vio.cameras.rectification_error import ErrorColumns
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.numerics.statistics import chi_square_quantile
+from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import FIELD_TERMS, Estimate, Observations
 
 
@@ -120,6 +120,7 @@ def _doubted(before: _Known, now: _Known, by_field: FloatArray) -> float:
     change = now.coefficients - before.coefficients
     variance = float(by_field @ before.covariance @ by_field)
     beyond = float(by_field @ change) ** 2 - _DRIFT.sigmas**2 * variance
-    squared = float(change @ np.linalg.solve(before.covariance, change))
+    # NaN, which exceeds nothing, where a back end holds terms constant
+    squared = squared_distance(change, before.covariance, 0.0)
     enlarged = (squared / _LIMIT - 1.0) * float(by_field @ now.covariance @ by_field)
-    return float(np.sqrt(max(beyond, enlarged, 0.0)))
+    return float(np.sqrt(max(0.0, beyond, enlarged)))
