@@ -258,9 +258,11 @@ def shared_rows(ids: IntArray, other: IntArray) -> tuple[IntArray, IntArray]:
     """Return the rows (K,) of the features that two frames share, in the one and in the other, in
     the order of their ids; the ids (N,) and (M,) of a frame are unique.
     """
+    ids = np.ascontiguousarray(ids, dtype=np.int64)  # others would be compiled for anew
+    other = np.ascontiguousarray(other, dtype=np.int64)
     rows = np.empty(min(ids.size, other.size), dtype=np.int64)
     others = np.empty_like(rows)
-    count = _meet(np.ascontiguousarray(ids), np.ascontiguousarray(other), rows, others)
+    count = _meet(ids, other, rows, others)
     if count >= 0:
         return rows[:count], others[:count]
     rows = ids.argsort()

@@ -9,11 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vio.cameras.rectification_error import ErrorColumns
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.monitor.calibration_drift import CalibrationDrift, ScaleDrift
 from vio.monitor.integrity import IntegrityMonitor
 from vio.monitor.run import RunMonitor
+from vio.numerics.statistics import chi_square_quantile
 from vio.records import (
     FIELD_TERMS,
     Estimate,
@@ -91,6 +93,33 @@ def test_terms_that_move_and_leave_lengths_as_they_are_enlarge_what_is_stated() 
     assert found[25].share > 5 * KNOWN_SIGMA * 400.0 / 8.0
 
 
+def test_terms_that_move_enlarge_what_is_stated_now() -> None:
+    """Healthy fisheye lenses at streets came to eleven times the sigma by what was stated before."""
+    tilt = np.zeros(FIELD_TERMS)
+    tilt[1] = 40 * KNOWN_SIGMA
+    before, now = 4 * KNOWN_SIGMA, KNOWN_SIGMA
+    sigmas = [PRIOR_SIGMA] + [before] * 19 + [now] * 20
+    found = drifts([0 * tilt] * 20 + [tilt] * 20, sigmas)[20]
+    factor = np.sqrt((tilt[1] / before) ** 2 / chi_square_quantile(0.999, FIELD_TERMS) - 1.0)
+    z = seen(0).z
+    disparity = z[:, 0] - z[:, 2]
+    J = ErrorColumns(CAMERA, np.arange(FIELD_TERMS)).jacobian(z)
+    by_field = disparity @ (J[:, 0] - J[:, 2]) / (disparity @ disparity)
+    assert found.share == pytest.approx(factor * now * np.linalg.norm(by_field))
+
+
+def test_a_back_end_that_holds_terms_constant_is_judged_by_the_others() -> None:
+    covariance = np.zeros((FIELD_TERMS, FIELD_TERMS))
+    check = CalibrationDrift(CAMERA)
+    for k in range(40):
+        yaw = 0.0 if k < 30 else 0.01
+        covariance[0, 0] = (PRIOR_SIGMA if k == 0 else KNOWN_SIGMA) ** 2
+        field = StereoFieldEstimate(constant_yaw(yaw), covariance.copy())
+        given = replace(estimate(k, constant_yaw(yaw), KNOWN_SIGMA), stereo_field=field)
+        share = check.frame(seen(k), given).share
+        assert (share > 0.4) == (k >= 30)  # of 0.5
+
+
 def test_without_right_pixels_or_a_field_nothing_is_judged() -> None:
     check = CalibrationDrift(CAMERA)
     for k in range(60):
@@ -150,3 +179,21 @@ def test_a_run_states_what_a_camera_that_sags_lets_positions_be_off_by() -> None
         sigma_m = np.sqrt(max(judged.covariance[0, 0] - given.covariance[0, 0], 0.0))
         assert judged.integrity == "nominal"
         assert least_m <= sigma_m <= most_m
+
+
+@pytest.mark.parametrize("anew", [False, True])
+def test_a_new_start_of_the_filter_is_no_drift_of_the_calibration(anew: bool) -> None:
+    """It gives up what it knew, so estimates vary by more than was stated before."""
+    rng = np.random.default_rng(3)
+    monitor = RunMonitor(CAMERA, np.eye(4), imu=False)
+    for k in range(80):
+        sigma = PRIOR_SIGMA if k == 0 or 40 <= k < 50 else KNOWN_SIGMA
+        given = estimate(k, sigma * rng.standard_normal(FIELD_TERMS) / 2, sigma)
+        monitor.observations(seen(k))
+        if k == 40 and anew:
+            monitor.begun_anew(k, given.time_ns - 50_000_000, given)
+        elif k == 40:
+            monitor.restarted(k, "it diverged", given)
+        monitor.update(k, UpdateReport(48, 0, 0, 0, 0.1, 1.0), given, measured=False)
+        monitor.judged(k, given)
+    assert all(mark.integrity != "nominal" for mark in monitor.take_marks())

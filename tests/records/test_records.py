@@ -52,6 +52,16 @@ def test_shared_rows_are_those_of_the_common_ids_in_their_order() -> None:
         assert ids[rows].tolist() == other[others].tolist() == common
 
 
+@pytest.mark.parametrize("kind", [np.uint64, np.uint8, np.int32, np.float64])
+def test_shared_rows_are_found_of_ids_of_any_type(kind: type[np.generic]) -> None:
+    """A plug-in's expected pixels have ids of its own type, and none are an empty list's floats."""
+    ids = np.array([7, 3, 5], dtype=kind)
+    rows, others = shared_rows(ids[:0], np.array([5, 7]))
+    assert (len(rows), len(others)) == (0, 0)
+    rows, others = shared_rows(np.array([5, 7, 9]), ids)
+    assert (rows.tolist(), others.tolist()) == ([0, 1], [2, 0])
+
+
 def test_a_trajectory_is_moved_to_the_other_frame_once() -> None:
     T_cam0_imu = np.eye(4)
     T_cam0_imu[:3, 3] = [1.0, 2.0, 3.0]

@@ -10,12 +10,13 @@ disparities were off by as much meanwhile, and so was the length of the motion.
 With the change `x` (8,) of the coefficients of (R3) in docs/math.md, `P` their covariance before,
 and `D` (N, 8) what they do to the disparities `d` (N,) of the features seen, lengths are off by the
 share `s = g' x`, `g = D' d / d' d`, by least squares: its part beyond `_DRIFT.sigmas` of its
-standard deviation `(g' P g)^1/2` is in doubt. So is that standard deviation times as much as the
-change as a whole, `x' P^-1 x`, is beyond its quantile: other terms that move say that the covariance
-is too small.
+standard deviation `(g' P g)^1/2` is in doubt. So is the present standard deviation times as much as
+the change as a whole, `x' P^-1 x`, is beyond its quantile: other terms that move say that the
+covariance is too small.
 
 Before motion has told much of the calibration, an estimate that moves is one whose prior was off,
-which is another matter: then nothing is concluded.
+which is another matter: then nothing is concluded. Nor is it across a new start of the filter, which
+gives up what was known.
 Reference for the change of an estimate: Hausman, Specification tests in econometrics, Econometrica
 (1978).
 """
@@ -31,7 +32,7 @@ from vio.cameras.rectification_error import ErrorColumns
 from vio.dataclass import dataclass
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.numerics.statistics import chi_square_quantile
+from vio.numerics.statistics import chi_square_quantile, squared_distance
 from vio.records import FIELD_TERMS, Estimate, Observations
 
 
@@ -41,8 +42,8 @@ class _DriftRules(NamedTuple):
     # Frames from the earlier estimate to the present one: a knock shows within the first, a sag of
     # seconds over the last.
     spans: tuple[int, ...] = (10, 20, 40)
-    # Standard deviations that a change is usual up to. The largest of healthy renders is 2.9; real
-    # lenses, which no polynomial describes, come to 7.6 of small ones.
+    # Standard deviations that a change is usual up to. The largest of healthy rooms is 3; where
+    # scenes are far, 9, and real lenses, which no polynomial describes, come to 7.6 of small ones.
     sigmas: float = 3.0
     # standard deviation of the share over the first one, up to which an estimate is known
     known_share: float = 0.5
@@ -97,6 +98,10 @@ class CalibrationDrift:
                 drifts.append(ScaleDrift(_doubted(before, now, by_field), span))
         return max(drifts, key=lambda drift: drift.share)
 
+    def begin_anew(self) -> None:
+        """Forget earlier estimates: the filter was started again, and knows less than before."""
+        self._known.clear()
+
     def _scale_by_field(self, seen: Observations) -> FloatArray | None:
         """The share (8,) of lengths by one unit of each coefficient; None: too few features tell."""
         z = seen.z[seen.has_right]
@@ -115,5 +120,7 @@ def _doubted(before: _Known, now: _Known, by_field: FloatArray) -> float:
     change = now.coefficients - before.coefficients
     variance = float(by_field @ before.covariance @ by_field)
     beyond = float(by_field @ change) ** 2 - _DRIFT.sigmas**2 * variance
-    squared = float(change @ np.linalg.solve(before.covariance, change))
-    return float(np.sqrt(max(beyond, (squared / _LIMIT - 1.0) * variance, 0.0)))
+    # NaN, which exceeds nothing, where a back end holds terms constant
+    squared = squared_distance(change, before.covariance, 0.0)
+    enlarged = (squared / _LIMIT - 1.0) * float(by_field @ now.covariance @ by_field)
+    return float(np.sqrt(max(0.0, beyond, enlarged)))

@@ -402,7 +402,7 @@ class RunMonitor:
         """Report that the back end diverged in a frame and was started again; repeats within a
         second are one event.
         """
-        self._add(self._updates.health.restarted(index, why, estimate))
+        self._add(self._updates.restarted(index, why, estimate))
 
     def begun_anew(self, index: int, good_ns: int, estimate: Estimate) -> None:
         """Report that the back end was begun anew in a frame, as its state was impossible; `good_ns`
@@ -410,6 +410,7 @@ class RunMonitor:
         """
         self._scale_lines = []
         self._integrity.end_since(good_ns, "scale-off")
+        self._updates.calibration.begin_anew()
         self._add([self._updates.health.begun_anew(index, good_ns, estimate)])
 
     def update(

@@ -58,12 +58,17 @@ class UpdateChecks:
         fresh.health.begin_again(self.health)
         return fresh
 
+    def restarted(self, index: int, why: str, estimate: Estimate) -> tuple[Finding, ...]:
+        """Return the findings on a filter that diverged in a frame and was started again."""
+        self.calibration.begin_anew()
+        return self.health.restarted(index, why, estimate)
+
     def frame(self, index: int, frame: UpdatedFrame, *, measured: bool) -> Iterator[Finding]:
         """Yield the findings of a frame; `measured`: whether a motion sensor carries the pose."""
         report = frame.report
         ratio = report.innovation_ratio
         if frame.restarted:
-            yield from self.health.restarted(index, frame.restarted, frame.estimate)
+            yield from self.restarted(index, frame.restarted, frame.estimate)
         yield from self.health.frame(index, report, frame.estimate)
         position = frame.estimate.T_world_imu[:3, 3]
         yield from self._order.frame(index, position, ratio if measured else None)
