@@ -200,3 +200,10 @@ def test_settings_of_one_camera_are_no_stereo_rig(setup: str, block: bool, tmp_p
     assert len(rig.cameras) == 1
     assert rig.cam0.coefficients[0] == 0.26
     assert rig.depth_factor == (5000.0 if setup == "RGBD" else None)
+
+
+@pytest.mark.parametrize("block", [False, True])
+def test_intrinsics_of_open3d_are_those_of_one_camera(block: bool, tmp_path: Path) -> None:
+    rig = vio.load_rig(forms.open3d(tmp_path, block=block))
+    assert rig.cam0 == forms.rectified_rig().cam0
+    assert rig.cam1 is None
