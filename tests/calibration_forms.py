@@ -916,6 +916,7 @@ FORMS = (
         "likewise, links the other way round",
         lambda f: depthai(f, inverted=True),
         replace(true_rig(), imu_noise=None, time_offset_s=0.0),
+        row=False,
     ),
     Form(
         "DepthAI",

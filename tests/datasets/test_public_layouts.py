@@ -281,3 +281,15 @@ def test_depth_images_may_lie_beside_the_images(image: str, inside: str, tmp_pat
     assert cv2.imwrite(str(folder / "right000000.jpg"), gray[0])
     with pytest.raises(DataError):
         open_dataset(scene)
+
+
+def test_a_folder_with_kittis_names_may_have_a_calibration_by_hand(tmp_path: Path) -> None:
+    folders = ("image_0", "image_1")
+    make_plain(tmp_path, 3, folders=folders, calibration=False, imu=False, times=False)
+    (tmp_path / "calib.txt").write_text("fx: 60\ncx: 32\ncy: 24\nbaseline: 0.2\n")
+    recording = open_dataset(tmp_path).recording
+    assert recording.kind == "plain"
+    assert (recording.camera.fu, recording.camera.baseline_m) == (60.0, pytest.approx(0.2))
+    (tmp_path / "calib.txt").write_text("fx: 60\ncx: 32\ncy: 24\n")
+    with pytest.raises(CalibrationError, match=r"lines begin with 'P\d:'"):
+        open_dataset(tmp_path)

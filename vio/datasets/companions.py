@@ -119,7 +119,8 @@ def find_calibration_of(layout: Layout) -> Path:
     raise CalibrationError(
         f"{layout.root}: no calibration; add one as calibration.yaml (Kalibr's camchain, OpenCV's "
         "M1 D1 M2 D2 R T), "
-        "calib.txt (KITTI's) or another that vio.load_rig reads, or name it with "
+        "calib.txt (KITTI's, or of a rectified pair lines 'fx: …', cx, cy, baseline in metres) or another "
+        "that vio.load_rig reads, or name it with "
         f"--calibration FILE; vio calibrate-rig makes one from a printed board{_unread(layout)}"
     )
 

@@ -61,6 +61,7 @@ from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.rigs.eth3d import FOLDERS as ETH3D_FOLDERS
 from vio.datasets.rigs.eth3d import is_eth3d
 from vio.datasets.rigs.names import named_calibration
+from vio.datasets.rigs.rectified_pair import is_rectified_pair
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.sides import (
     first_pair,
@@ -298,15 +299,17 @@ def seen_folders(path: Path) -> str:
 
 
 def holds_more_than_kitti(path: Path) -> bool:
-    """Return whether a folder with KITTI's names has an IMU, or another calibration that goes
-    before `calib.txt`.
+    """Return whether a folder with KITTI's names has an IMU, another calibration that goes before
+    `calib.txt`, or one of another form by that name.
     """
     if not is_plain_folder(path):
         return False
     if imu_files(path):
         return True
     found = named_calibration(path) or rigs.find_calibration(path)
-    return found not in (None, path / "calib.txt")
+    if found != path / "calib.txt":
+        return found is not None
+    return is_rectified_pair(found)
 
 
 def lacks_sensor_yaml(path: Path) -> bool:
