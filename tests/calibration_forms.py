@@ -509,6 +509,15 @@ def virtual_kitti(folder: Path) -> Path:
     return _save(folder, "intrinsic.txt", lenses)
 
 
+def open3d(folder: Path, *, block: bool = False) -> Path:
+    """Column by column; in a block where the pose is beside it."""
+    c = rectified_rig().cam0
+    K = [c.fu, 0.0, 0.0, 0.0, c.fv, 0.0, c.cu, c.cv, 1.0]
+    data = {"width": c.width, "height": c.height, "intrinsic_matrix": K}
+    stated = {"extrinsic": np.eye(4).ravel().tolist(), "intrinsic": data} if block else data
+    return _save(folder, "camera_intrinsic.json", json.dumps(stated))
+
+
 def okvis(folder: Path) -> Path:
     """The time shift has the opposite sign of Kalibr's."""
     rig = true_rig()
@@ -907,6 +916,7 @@ FORMS = (
         "likewise, links the other way round",
         lambda f: depthai(f, inverted=True),
         replace(true_rig(), imu_noise=None, time_offset_s=0.0),
+        row=False,
     ),
     Form(
         "DepthAI",

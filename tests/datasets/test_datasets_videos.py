@@ -89,6 +89,22 @@ def test_side_by_side_images_and_video_are_the_same_recording(
         assert all(frame.right is None for frame in frames_of(left))
 
 
+@pytest.mark.parametrize("stacked", [False, True])
+def test_a_calibration_without_a_size_tells_what_one_video_holds(
+    stacked: bool, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 255, (48, 64), dtype=np.uint8) for _ in range(3)]
+    stack = np.vstack if stacked else np.hstack
+    write_video(tmp_path / "both.avi", [stack([image, image]) for image in images])
+    (tmp_path / "calib.txt").write_text("fx: 60\ncx: 31\ncy: 23\nbaseline: 0.2\n")
+    if stacked:
+        with pytest.raises(DataError, match=r"whole width, not of its left half.* above the other"):
+            open_dataset(tmp_path)
+    else:
+        assert open_dataset(tmp_path).recording.camera.width == 64
+
+
 def test_one_video_of_one_camera_is_not_cut(videos: Path, tmp_path: Path) -> None:
     shutil.copytree(videos, tmp_path / "r")
     (tmp_path / "r" / "right.avi").unlink()

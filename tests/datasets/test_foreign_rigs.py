@@ -200,3 +200,62 @@ def test_settings_of_one_camera_are_no_stereo_rig(setup: str, block: bool, tmp_p
     assert len(rig.cameras) == 1
     assert rig.cam0.coefficients[0] == 0.26
     assert rig.depth_factor == (5000.0 if setup == "RGBD" else None)
+
+
+@pytest.mark.parametrize("block", [False, True])
+def test_intrinsics_of_open3d_are_those_of_one_camera(block: bool, tmp_path: Path) -> None:
+    rig = vio.load_rig(forms.open3d(tmp_path, block=block))
+    assert rig.cam0 == forms.rectified_rig().cam0
+    assert rig.cam1 is None
+
+
+NAMED_NUMBERS = {
+    "calibration.yaml": "fx: 700.0\nfy: 700.0\ncx: 640.0\ncy: 360.0\nbaseline: 0.11\n",
+    "calibration.json": '{"f": 700, "cx": 640, "cy": 360, "baseline_m": 0.11}',
+    "calib.txt": "# by hand\nfx = 700\nfy = 700  # pixels\ncx = 640\ncy = 360\nbaseline_mm = 110\n",
+    "camera.json": '{"intrinsic": {"fx": 700, "fy": 700, "u0": 640, "v0": 360}, '
+    '"extrinsic": {"baseline": 0.11, "pitch": 0.03, "x": 1.7}}',
+    "stereodemo_calibration.json": '{"width": 1280, "height": 720, "fx": 700, "fy": 700, '
+    '"cx0": 640, "cx1": 640, "cy": 360, "baseline_meters": 0.11, "depth_range": [0.3, 20]}',
+    "K.txt": "700 0 640 0 700 360 0 0 1\n0.11\n",
+    "intrinsics.txt": "700 0 640\n0 700 360\n0 0 1\n0.11\n",
+}
+
+
+@pytest.mark.parametrize("name", NAMED_NUMBERS)
+def test_the_numbers_of_a_rectified_pair_are_a_calibration(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(NAMED_NUMBERS[name])
+    rig = vio.load_rig(tmp_path, image_size=forms.SIZE)
+    _close(rig, forms.imu_free(forms.rectified_rig()))
+    assert rig.is_rectified
+    assert not rig.notes
+
+
+def test_the_numbers_of_a_rectified_pair_state_what_they_are_of(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.yaml"
+    path.write_text(f"{NAMED_NUMBERS['calibration.yaml']}cx1: 652.0\nwidth: 1280\nheight: 720\n")
+    rig = vio.load_rig(path)
+    assert (rig.cam0.cu, rig.right[0].cu) == (640.0, 652.0)
+    for lens in ("k1: 0.0\n", "distortion: [0, 0, 0, 0]\n"):
+        path.write_text(NAMED_NUMBERS["calibration.yaml"] + lens)
+        assert vio.load_rig(path, image_size=forms.SIZE).is_rectified
+    for lens in ("k1: -0.2\n", "distortion: [-0.2, 0, 0, 0]\n"):
+        path.write_text(NAMED_NUMBERS["calibration.yaml"] + lens)
+        with pytest.raises(CalibrationError, match=r"states a distortion .* and a baseline alone"):
+            vio.load_rig(path, image_size=forms.SIZE)
+    path.write_text(NAMED_NUMBERS["calibration.yaml"].replace("0.11", "110"))
+    notes = vio.load_rig(path, image_size=forms.SIZE).notes
+    assert any("name it baseline_mm" in note for note in notes)
+    path.write_text(NAMED_NUMBERS["calibration.yaml"].replace("0.11", "-0.11"))
+    with pytest.raises(CalibrationError, match="baseline must be positive"):
+        vio.load_rig(path, image_size=forms.SIZE)
+    with pytest.raises(CalibrationError, match="states no image size"):
+        vio.load_rig(path)
+
+
+def test_nine_numbers_in_a_line_may_be_a_matrix(tmp_path: Path) -> None:
+    path = tmp_path / "K.txt"
+    path.write_text("700 0 640 0 701 360 0 0 1\n")
+    camera = vio.load_rig(path, image_size=forms.SIZE).cam0
+    assert (camera.fu, camera.fv, camera.cu, camera.cv) == (700, 701, 640, 360)
+    assert not camera.coefficients

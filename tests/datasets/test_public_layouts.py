@@ -4,10 +4,12 @@ recording.
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,8 +17,9 @@ import vio
 from tests.plain_maker import STEP_S, make_plain
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
-from vio.datasets.sides import stamped_sides
+from vio.datasets.sides import first_pair, pairs_of, stamped_sides
 from vio.errors import CalibrationError, DataError
+from vio.records import StereoFrame
 
 FIRST_NS = 1700000000_000000000
 
@@ -235,3 +238,58 @@ def test_a_rendered_drive_has_its_views_beside_depths_and_its_truth(tmp_path: Pa
     last = len(poses) - 2
     (tmp_path / "extrinsic.txt").write_text("\n".join(poses[:last]) + "\n")
     assert len(open_dataset(tmp_path).recording.reference or ()) == 2
+
+
+def test_numbered_parts_of_one_camera_are_no_pair(tmp_path: Path) -> None:
+    """Folders 000, 001 and 002: the first two had been taken for the left and the right camera."""
+    for part in range(3):
+        folders = (f"left/{part:03d}", f"right/{part:03d}")
+        make_plain(tmp_path, 2, folders=folders, imu=False, reference=False)
+    for path in (tmp_path, tmp_path / "left"):
+        with pytest.raises(DataError, match="not clear which is the left and which the right"):
+            open_dataset(path)
+    assert first_pair(pairs_of(["000", "001"])) == ("000", "001")
+    assert first_pair(pairs_of(["cam0", "cam1", "cam2"])) == ("cam0", "cam1")
+
+
+@pytest.mark.parametrize(("image", "inside"), [("frame", "results"), ("left", "")])
+def test_depth_images_may_lie_beside_the_images(image: str, inside: str, tmp_path: Path) -> None:
+    """As Replica's results/frame000000.jpg and depth000000.png with cam_params.json above, and a ZED's
+    export of left images and depths.
+    """
+    scene = tmp_path / "room0"
+    folder = scene / inside
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    gray = rng.integers(0, 255, (4, 48, 64), dtype=np.uint8)
+    for k in range(4):
+        assert cv2.imwrite(str(folder / f"{image}{k:06d}.jpg"), gray[k])
+        depth = np.full((48, 64), 6553 * (k + 1), dtype=np.uint16)
+        assert cv2.imwrite(str(folder / f"depth{k:06d}.png"), depth)
+    camera = {"w": 64, "h": 48, "fx": 60.0, "fy": 61.0, "cx": 31.5, "cy": 23.5, "scale": 6553.0}
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    poses = [f"1 0 0 {k} 0 1 0 0 0 0 1 0 0 0 0 1" for k in range(4)]
+    (scene / "traj.txt").write_text("\n".join(poses) + "\n")
+    dataset = open_dataset(scene)
+    assert dataset.recording.kind == "rgbd"
+    assert dataset.recording.camera.fu == 60.0
+    assert dataset.recording.reference is not None
+    np.testing.assert_allclose(dataset.recording.reference.positions[:, 0], range(4))
+    frames = [event for event in dataset.events() if isinstance(event, StereoFrame)]
+    medians = [float(np.median(frame.depth)) for frame in frames if frame.depth is not None]
+    np.testing.assert_allclose(medians, [1.0, 2.0, 3.0, 4.0])
+    assert cv2.imwrite(str(folder / "right000000.jpg"), gray[0])
+    with pytest.raises(DataError):
+        open_dataset(scene)
+
+
+def test_a_folder_with_kittis_names_may_have_a_calibration_by_hand(tmp_path: Path) -> None:
+    folders = ("image_0", "image_1")
+    make_plain(tmp_path, 3, folders=folders, calibration=False, imu=False, times=False)
+    (tmp_path / "calib.txt").write_text("fx: 60\ncx: 32\ncy: 24\nbaseline: 0.2\n")
+    recording = open_dataset(tmp_path).recording
+    assert recording.kind == "plain"
+    assert (recording.camera.fu, recording.camera.baseline_m) == (60.0, pytest.approx(0.2))
+    (tmp_path / "calib.txt").write_text("fx: 60\ncx: 32\ncy: 24\n")
+    with pytest.raises(CalibrationError, match=r"lines begin with 'P\d:'"):
+        open_dataset(tmp_path)

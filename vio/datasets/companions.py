@@ -19,6 +19,7 @@ from vio.datasets.common import naming
 from vio.datasets.image_pairs import ImageSize
 from vio.datasets.json_lines import read_imu_lines
 from vio.datasets.kitti import read_extrinsics
+from vio.datasets.rigs.camera_json import REPLICA
 from vio.datasets.rigs.eth3d import EXTRINSICS, FOLDERS, is_eth3d, truth_of_left
 from vio.datasets.rigs.four_seasons import STEREO, TRANSFORMS, read_imu_transform
 from vio.datasets.rigs.plausible import noting_imu_place
@@ -92,7 +93,8 @@ def calibration_beside(layout: Layout) -> Path | None:
             return folder / "undistorted_calib_0.txt"
         if (found := rigs.find_calibration(folder)) is not None:
             return found
-    return None
+    of_all = layout.root.absolute().parent / REPLICA
+    return of_all if of_all.is_file() else None
 
 
 def _folders_of_calibrations(layout: Layout) -> list[Path]:
@@ -117,7 +119,8 @@ def find_calibration_of(layout: Layout) -> Path:
     raise CalibrationError(
         f"{layout.root}: no calibration; add one as calibration.yaml (Kalibr's camchain, OpenCV's "
         "M1 D1 M2 D2 R T), "
-        "calib.txt (KITTI's) or another that vio.load_rig reads, or name it with "
+        "calib.txt (KITTI's, or of a rectified pair lines 'fx: …', cx, cy, baseline in metres) or another "
+        "that vio.load_rig reads, or name it with "
         f"--calibration FILE; vio calibrate-rig makes one from a printed board{_unread(layout)}"
     )
 
@@ -421,6 +424,8 @@ def _read_reference(
     layout = images.layout
     bases = (layout.root, layout.base, layout.root / "dso")
     file = next((f for n in _REFERENCES for base in bases if (f := base / n).is_file()), None)
+    if file is None and images.calibration[0].name == REPLICA:
+        file = next((f for f in (layout.root / "traj.txt",) if f.is_file()), None)
     truth = poses_of_left(layout.root) if file is None else read_trajectory(file)
     if truth is None:
         return None, None

@@ -61,8 +61,16 @@ from vio.datasets.rigs.bare import NAMES as BARE_NAMES
 from vio.datasets.rigs.eth3d import FOLDERS as ETH3D_FOLDERS
 from vio.datasets.rigs.eth3d import is_eth3d
 from vio.datasets.rigs.names import named_calibration
+from vio.datasets.rigs.rectified_pair import is_rectified_pair
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.sides import first_pair, pairs_of, split_sides, stamped_sides, words_of
+from vio.datasets.sides import (
+    first_pair,
+    pairs_of,
+    split_depths,
+    split_sides,
+    stamped_sides,
+    words_of,
+)
 from vio.datasets.tables import drive_times
 from vio.datasets.tum_rgbd import (
     DEPTH_FACTOR,
@@ -188,11 +196,7 @@ def _pair_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
         DataError: each image has a time or number of its own, and those of the cameras fit none of
             each other's.
     """
-    layout = _layout_of_one(path)
-    if layout is None and _holds_images(path):
-        layout = Layout(path, path, path, path)
-    if layout is None:
-        layout = _only_folder(path)
+    layout = _one_folder(path)
     if layout is None:
         return None
     files = list_images(layout.left)
@@ -207,6 +211,29 @@ def _pair_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
     alone = len(files) - 2 * len(pairs)
     lone = (f"{alone} images have no partner and are skipped",) if alone else ()
     return layout, _Images(pairs, lone)
+
+
+def _depths_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
+    """Return where images and their depth images lie in one folder, and both; None: there are none."""
+    layout = _one_folder(path)
+    if layout is None:
+        return None
+    files = list_images(layout.left)
+    parts = split_depths(files.names)
+    if parts is None:
+        return None
+    images, depths = (ImageFiles(files.folder, tuple(names)) for names in parts)
+    return layout, _Images(FilePairs(images, images), depths=depths)
+
+
+def _one_folder(path: Path) -> Layout | None:
+    """Return the layout of the folder in which all images of a recording lie; None: there is none, or
+    there are several.
+    """
+    layout = _layout_of_one(path)
+    if layout is None and _holds_images(path):
+        layout = Layout(path, path, path, path)
+    return _only_folder(path) if layout is None else layout
 
 
 def _only_folder(path: Path) -> Layout | None:
@@ -272,15 +299,17 @@ def seen_folders(path: Path) -> str:
 
 
 def holds_more_than_kitti(path: Path) -> bool:
-    """Return whether a folder with KITTI's names has an IMU, or another calibration that goes
-    before `calib.txt`.
+    """Return whether a folder with KITTI's names has an IMU, another calibration that goes before
+    `calib.txt`, or one of another form by that name.
     """
     if not is_plain_folder(path):
         return False
     if imu_files(path):
         return True
     found = named_calibration(path) or rigs.find_calibration(path)
-    return found not in (None, path / "calib.txt")
+    if found != path / "calib.txt":
+        return found is not None
+    return is_rectified_pair(found)
 
 
 def lacks_sensor_yaml(path: Path) -> bool:
@@ -321,7 +350,9 @@ def is_mono_folder(path: Path) -> bool:
 def is_rgbd_folder(path: Path) -> bool:
     """Return whether a folder holds images and depth images."""
     layout = _layout_of_one(path)
-    return is_tum_folder(path) or (layout is not None and _holds_images(layout.base / "depth"))
+    if is_tum_folder(path) or (layout is not None and _holds_images(layout.base / "depth")):
+        return True
+    return _depths_in_one_folder(path) is not None
 
 
 def _layout(path: Path, choices: Sequence[tuple[str, ...]] = _PAIRS) -> Layout | None:
@@ -524,6 +555,8 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> ImageDataset:
         return _read("rgbd", Layout(path, path, folder, folder), images, settings)
     layout = _layout_of_one(path)
     if layout is None or not _holds_images(layout.base / "depth"):
+        if (found := _depths_in_one_folder(path)) is not None:
+            return _read("rgbd", *found, settings)
         raise DataError(
             f"{path}: holds no images beside depth/; give rgb.txt and depth.txt, or left/ and "
             "depth/"

@@ -55,8 +55,12 @@ def pairs_of(names: list[str]) -> list[tuple[str, str]]:
 
 def first_pair(pairs: list[tuple[str, str]]) -> tuple[str, str] | None:
     """Return the only pair that is named as left and right, else the only one that is numbered 0
-    and 1, else the only one; None: it is not clear, as of cameras 1, 2 and 3.
+    and 1, else the only one; None: it is not clear, as of cameras 1, 2 and 3, or of three folders
+    000, 001 and 002, which are as well parts of one camera's images.
     """
+    bare = [pair for pair in pairs if all(word.isdigit() for word in words_of(pair[0]))]
+    if len(bare) > 1:
+        pairs = [pair for pair in pairs if pair not in bare]
     named = [pair for pair in pairs if side_word(pair[0]) == "left"]
     zero = [pair for pair in pairs if "0" in _differing(*pair)]
     best = named or zero or pairs
@@ -96,6 +100,25 @@ def _in_pairs(
     if not pairs or alone > len(pairs):
         return None
     return [pair["left"] for pair in pairs], [pair["right"] for pair in pairs]
+
+
+def split_depths(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
+    """Return the names of images and of their depth images that lie in one folder, in pairs
+    (`frame000017`, `depth000017`); None: they are not of both, or one of a right camera is there.
+    """
+    images: dict[tuple[str, ...], str] = {}
+    depths: dict[tuple[str, ...], str] = {}
+    for name in names:
+        words = words_of(os.path.splitext(name)[0])
+        frame = tuple(word for word in words if word.isdigit())
+        kind = depths if "depth" in words else images
+        if frame in kind or side_word(name) == "right":
+            return None
+        kind[frame] = name
+    both = [frame for frame in images if frame in depths]
+    if not both or 2 * len(both) < len(images):
+        return None
+    return [images[frame] for frame in both], [depths[frame] for frame in both]
 
 
 def stamped_sides(names: Sequence[str]) -> tuple[list[str], list[str]] | None:

@@ -37,6 +37,8 @@ from vio.errors import DataError
 from vio.records import NS_PER_S, Image, IntArray, StereoFrame
 
 SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
+# of half the width of a video, beyond which a principal point is that of its whole width
+_OF_WHOLE_WIDTH = 0.85
 _NAMES = (
     ("left", "right"),
     ("Left", "Right"),
@@ -151,7 +153,9 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
 
 
 def _check_side_by_side(rig: Rig, video: _Facts, path: Path, calibration: Path) -> None:
-    """Raise DataError where a calibration is not of half the width of a single video."""
+    """Raise DataError where a calibration is not of half the width of a single video, by the size that
+    it states, or by a principal point in the middle of the whole width.
+    """
     if (rig.cam0.width, rig.cam0.height) != (video.width // 2, video.height):
         # no frame in the middle: all before it would be decoded
         doubt = alternating_note(min(video.count, _LOOKED_AT), _loader(path))
@@ -161,6 +165,16 @@ def _check_side_by_side(rig: Rig, video: _Facts, path: Path, calibration: Path) 
             f"{calibration} is for images of {rig.cam0.width} x {rig.cam0.height}{hint}; side by "
             "side they would have twice that width; give left.mp4 and right.mp4, or the "
             f"calibration of these images{'' if doubt is None else f'; {doubt}'}"
+        )
+    if rig.cam0.cu > _OF_WHOLE_WIDTH * rig.cam0.width:
+        size = (video.width, video.height)
+        is_low = rig.cam0.cv < video.height / 3  # the middle of an upper half is at a quarter
+        hint = stacked_hint(size, (video.width, video.height // 2)) if is_low else ""
+        raise DataError(
+            f"{path} is the only video, of {video.width} x {video.height} pixels, and the principal "
+            f"point of {calibration}, {rig.cam0.cu:.0f}, {rig.cam0.cv:.0f}, is near the middle of its "
+            f"whole width, not of its left half{hint}; give left.mp4 and right.mp4, or the calibration "
+            "of these images"
         )
 
 

@@ -30,6 +30,7 @@ from vio.datasets.rigs import (
     bare,
     basalt,
     boofcv,
+    camera_json,
     camodocal,
     depthai,
     dsec,
@@ -40,6 +41,7 @@ from vio.datasets.rigs import (
     mrpt,
     okvis,
     orbslam,
+    rectified_pair,
     spectacular,
     zed,
 )
@@ -81,7 +83,7 @@ KNOWN = (
     "or calib_cam_to_cam.txt, OpenCV's stereo .yml, .xml or .npz (M1 D1 M2 D2 R T), ROS's left.yaml and "
     "right.yaml, BoofCV's stereo.xml, or MATLAB's stereo parameters; or the settings of ORB-SLAM, stella_vslam, "
     "VINS, OKVIS, Kimera or SVO, Basalt's, Monado's, DepthAI's or Spectacular AI's JSON, cuVSLAM's EDEX, or a "
-    "ZED's SN*.conf"
+    "ZED's SN*.conf; of a rectified pair, lines 'fx: …', cx, cy, baseline (metres) will do"
 )
 _INI = (".conf", ".ini")
 _OTHERS = (
@@ -123,11 +125,13 @@ _FORMATS: tuple[tuple[Callable[[Entries], bool], Callable[[Source], Rig]], ...] 
     (zed.matches, zed.read),
     (mrpt.matches, mrpt.read),
     (dsec.matches, dsec.read),
+    (camera_json.matches, camera_json.read),
     (matlab.matches, matlab.read),
     (lambda entries: _NAMED in entries, lambda source: _openvins(source)),
     (lambda entries: _is_sensor_sheet(entries), lambda source: _euroc(source)),
     (is_camera_info, lambda source: _camera_infos(source)),
     (is_opencv, lambda source: rig_from_opencv(source.entries, source.where, source.image_size)),
+    (rectified_pair.matches, rectified_pair.read),
 )
 
 
@@ -314,6 +318,9 @@ def _read_txt(path: Path, image_size: Size | None) -> Rig:
     rig = read_middlebury(path, image_size)
     if rig is not None:
         return rig
+    entries = rectified_pair.read_lines(path)
+    if rectified_pair.matches(entries):
+        return rectified_pair.read(Source(path, entries, image_size))
     if not any(re.match(r"P\d:", line) for _, line in text_lines(path)):
         raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
     return kitti_rig(path, image_size)[0]

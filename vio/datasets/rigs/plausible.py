@@ -252,6 +252,21 @@ def _factors(ratios: FloatArray) -> str:
     return f"{ratios[0]:.3g} along x and {ratios[1]:.3g} along y"
 
 
+def baseline_doubt(baseline: float, where: Path | str) -> str | None:
+    """Return the doubt about a baseline whose unit a file does not state.
+
+    Args:
+        baseline: as the file has it.
+        where: the file.
+    """
+    if baseline <= _SQUARES_M:
+        return None
+    return (
+        f"{where}: doubtful: the baseline is {baseline:g} m, if its unit is the metre; if it is the "
+        "millimetre, name it baseline_mm, or all lengths of the run will be in that unit"
+    )
+
+
 def unit_doubt(baseline: float, where: Path | str) -> str | None:
     """Return the doubt about a stereo translation whose unit OpenCV's files do not state.
 
