@@ -52,6 +52,23 @@ def test_settings_of_a_run_are_no_path() -> None:
         vio.run(dataset, settings)
 
 
+@pytest.mark.parametrize(
+    ("argument", "given", "asked"),
+    [
+        ("parts", "orb", "parts: give vio.Parts"),
+        ("map", "yard.map", "map: give vio.MapUse"),
+        ("control", "runs/first", "control: give vio.RunControl"),
+        ("control", vio.RunControl(folder="runs/first"), "folder: give vio.runs.recorder.Growing"),  # type: ignore[arg-type]
+    ],
+)
+def test_parts_maps_and_folders_of_a_run_are_no_names(
+    argument: str, given: Any, asked: str, tmp_path: Path
+) -> None:
+    dataset: Any = vio.open_dataset(make_plain(tmp_path / "plain"))
+    with pytest.raises(TypeError, match=asked):
+        vio.run(dataset, Config(), **{argument: given})
+
+
 def test_trajectories_and_lists_are_asked_for_where_paths_and_texts_are_given() -> None:
     poses = Trajectory(np.tile(np.eye(4), (3, 1, 1)), None, "cam0")
     with pytest.raises(TypeError, match=r"reference: give a Trajectory, .*, not str"):

@@ -200,9 +200,11 @@ def run(
         VioError: the configuration, the data or the estimation is at fault; the message says which.
             With a folder, a fault after the first frame ends the run in order instead, and the
             result names it.
-        TypeError: a path is given in the place of the recording, or a dictionary for the settings.
+        TypeError: a path is given in the place of the recording, a dictionary for the settings, or a
+            name for a part, a map or a folder.
     """
     refuse_other_types(config, dataset=dataset)
+    _check_arguments(parts, map, control)
     _check_range(dataset.recording, start, stop)
     with contextlib.closing(Viewers(() if viewer is None else (viewer,))) as shown:
         what = _Run(dataset, config, start, stop, keep_observations, shown, parts, map, control)
@@ -214,6 +216,19 @@ def run(
                 repair = found.repair
                 if found.others:
                     log.warning("warnings so far are of images that are put right now; forget them")
+
+
+def _check_arguments(parts: object, map_use: object, control: object) -> None:
+    """Raise TypeError where a name, a path or a class is given in the place of an argument."""
+    folder = control.folder if isinstance(control, RunControl) else None
+    for name, value, wanted, call in (
+        ("parts", parts, Parts, "vio.Parts(…)"),
+        ("map", map_use, MapUse | None, "vio.MapUse(…)"),
+        ("control", control, RunControl, "vio.RunControl(…)"),
+        ("folder", folder, GrowingFolder | None, "vio.runs.recorder.GrowingFolder(path, {})"),
+    ):
+        if not isinstance(value, wanted):
+            raise TypeError(f"{name}: give {call}, not {type(value).__name__}")
 
 
 class _BeginAgainError(Exception):
