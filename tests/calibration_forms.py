@@ -455,6 +455,26 @@ def mrpt(folder: Path) -> Path:
     return _save(folder, "calib.ini", text)
 
 
+def mrpt2(folder: Path) -> Path:
+    """With k4 to k6, as MRPT 2 writes it, which states a model."""
+    file = mrpt(folder)
+    text = file.read_text().replace("0.0]    //", "0.0 0 0 0 ]    //")
+    file.write_text(text.replace("dist =", "distortion_model = plumb_bob\ndist ="))
+    return file
+
+
+def mrpt2_fisheye(folder: Path) -> Path:
+    """Of a rig whose lenses are OpenCV's fisheye: four coefficients."""
+    file = mrpt(folder)
+    lines = file.read_text().splitlines()
+    places = [k for k, line in enumerate(lines) if line.startswith("dist =")]
+    for place, camera in zip(places, true_rig("equidistant").cameras, strict=True):
+        bend = " ".join(map(repr, camera.coefficients))
+        lines[place] = f"distortion_model = kannala_brandt\ndist = [{bend} ]"
+    file.write_text("\n".join(lines) + "\n")
+    return file
+
+
 def mrpt_text(folder: Path) -> Path:
     """As the Malaga sets name it."""
     return mrpt(folder).rename(folder / "camera_params_raw_1280x720.txt")
@@ -975,6 +995,8 @@ FORMS = (
     Form("ZED", "`SN*.conf` with `LEFT_DISTO`, fisheye", zed_x, imu_free(true_rig("equidistant")), SIZE, row=False),
     Form("ZED", "`SN*.conf`, images of another size", zed, None, (640, 480)),
     Form("MRPT", "`calib.ini`", mrpt, imu_free(true_rig()), row=False),
+    Form("MRPT", "likewise of MRPT 2", mrpt2, imu_free(true_rig()), row=False),
+    Form("MRPT", "likewise of MRPT 2, fisheye", mrpt2_fisheye, imu_free(true_rig("equidistant")), row=False),
     Form("MRPT", "`camera_params_raw_*.txt` of Malaga", mrpt_text, imu_free(true_rig()), row=False),
     Form("DSEC", "`cam_to_cam.yaml`", dsec, imu_free(rectified_rig()), row=False),
     Form("DrivingStereo", "`half-image-calib`", driving_stereo, imu_free(rectified_rig()), row=False),

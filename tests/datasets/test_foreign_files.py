@@ -72,7 +72,12 @@ def test_what_takes_the_place_of_another_thing_is_named(
         assert "the estimate goes first" in caplog.text
         caplog.clear()
     capsys.readouterr()
-    for estimate, reference in ((run, truth), (run, run)):
+    beside = run / "ground_truth.tum"  # as people copy it to a run, and as `reference.tum`
+    shutil.copy(truth, beside)
+    shutil.copy(truth, run / "reference.tum")
+    for estimate, reference in (
+        (run, truth), (run, run), (truth, beside), (truth, run / "reference.tum"),
+    ):  # fmt: skip
         assert main(["eval", str(estimate), str(reference)]) == 0
         assert "the estimate goes first" not in caplog.text
     assert "the page is HTML; name it page.html" in refused(

@@ -934,6 +934,8 @@ def test_real_calibrations(name: str, baseline_m: float, imu: bool, data_dir: Pa
     [
         ({"path": None}, "named by one path, as text or pathlib.Path, not by NoneType"),
         ({"image_size": (375, 1242, 3)}, "give the width and the height of the images, as"),
+        ({"image_size": ((375, 1242), 3)}, "give the width and the height of the images, as"),
+        ({"image_size": (np.nan, 375)}, "image_size: an image of nan x 375 pixels; give whole"),
         ({"image_size": 1242}, "give the width and the height of the images, as"),
         ({"cameras": "2"}, "cameras is '2'; give 1, 2 or None"),
     ],

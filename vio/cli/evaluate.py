@@ -359,10 +359,11 @@ def _read(path: Path, compared_with: Path | None = None) -> tuple[Trajectory, Fl
 
 
 def _is_of_run(path: Path) -> bool:
-    """Return whether a path is a run's folder, or a file in one."""
-    from vio.runs.files import RunFile
+    """Return whether a path is a run's folder, or a trajectory that the run wrote there."""
+    from vio.runs.files import ESTIMATED, RunFile
 
-    return any((folder / RunFile.METRICS).is_file() for folder in (path, path.parent))
+    folder = path.parent if path.name in ESTIMATED else path
+    return (folder / RunFile.METRICS).is_file()
 
 
 def _truth_of(path: Path) -> tuple[Trajectory, FloatArray | None]:

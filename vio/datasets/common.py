@@ -142,12 +142,12 @@ def image_size(values: Sequence[float], where: str) -> tuple[int, int]:
     Raises:
         CalibrationError: they are not positive whole numbers.
     """
-    width, height = (int(value) for value in values)
-    if [width, height] != list(values) or min(width, height) < 1:
+    if not all(math.isfinite(value) and value >= 1 and value == int(value) for value in values):
         raise CalibrationError(
             f"{where}: an image of {values[0]:g} x {values[1]:g} pixels; give whole, positive "
             "numbers"
         )
+    width, height = (int(value) for value in values)
     return width, height
 
 

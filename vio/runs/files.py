@@ -44,5 +44,13 @@ class MeshFile:
 
 
 FILES = tuple(value for name, value in vars(RunFile).items() if name.isupper())
+# trajectories that are a run's estimates, unlike its reference
+ESTIMATED = (
+    RunFile.TRAJECTORY,
+    RunFile.TRAJECTORY_KITTI,
+    RunFile.DEAD_RECKONING,
+    RunFile.MAP_TRAJECTORY,
+    RunFile.MAP_CAUSAL,
+)
 CHECKPOINT = "checkpoint"  # in UNFINISHED, as are the tables
 REQUEST = "run.json"  # likewise: what the run was asked to do

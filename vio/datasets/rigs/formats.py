@@ -186,7 +186,10 @@ def load_rig(
 
 def _checked_size(size: Size) -> Size:
     """Return the width and the height that a caller gives, as whole numbers."""
-    values = np.asarray(size)
+    try:
+        values = np.asarray(size)
+    except ValueError:  # as of ((1280, 720), 3)
+        values = np.empty(0)
     if values.shape != (2,) or values.dtype.kind not in "iuf":
         raise CalibrationError(
             f"image_size is {size!r}; give the width and the height of the images, as (1280, 720)"

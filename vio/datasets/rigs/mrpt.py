@@ -1,10 +1,11 @@
 """MRPT's calibration of a pair, an INI file, as kinect-stereo-calib writes it and the Malaga sets have it.
 
 `[CAMERA_PARAMS_LEFT]` and `[CAMERA_PARAMS_RIGHT]`: `resolution`, `cx cy fx fy` in pixels, `dist` of
-OpenCV's model, k1 k2 p1 p2 k3. `[CAMERA_PARAMS_LEFT2RIGHT_POSE]`: `pose_quaternion`, the pose of the
-right camera in the left one, x y z in metres and a quaternion w x y z. The part before `LEFT` may
-differ.
-Reference: MRPT's TStereoCamera; Blanco et al., The Malaga Urban Dataset (2014).
+OpenCV's model, k1 k2 p1 p2 k3. MRPT 2 states a `distortion_model` as well: `plumb_bob`, with or without
+k4 k5 k6, `kannala_brandt`, OpenCV's fisheye, k1 to k4, or `none`. `[CAMERA_PARAMS_LEFT2RIGHT_POSE]`:
+`pose_quaternion`, the pose of the right camera in the left one, x y z in metres and a quaternion w x y z.
+The part before `LEFT` may differ.
+Reference: MRPT's TStereoCamera and TCamera; Blanco et al., The Malaga Urban Dataset (2014).
 """
 
 from __future__ import annotations
@@ -22,11 +23,17 @@ from vio.datasets.rigs.source import Source
 from vio.datasets.yaml_files import Entries, section
 from vio.errors import CalibrationError
 from vio.files.text import text_lines
-from vio.geometry.distortion import CameraModel
+from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, se3_inverse
 from vio.geometry.stereo import intrinsic_matrix
 
 _POSE = "LEFT2RIGHT_POSE"
+# ours, and how many coefficients there may be
+_MODELS: dict[str, tuple[DistortionModel, tuple[int, ...]]] = {
+    "plumb_bob": ("radtan", (5, 8)),
+    "kannala_brandt": ("equidistant", (4,)),
+    "none": ("radtan", (0,)),
+}
 
 
 def is_mrpt(path: Path) -> bool:
@@ -70,15 +77,27 @@ def _prefix(entries: Entries) -> str | None:
 def _camera(block: Mapping[str, object], where: str) -> CameraModel:
     size = image_size(_values(block, "resolution", 2, where).tolist(), f"{where}, resolution")
     cx, cy, fx, fy = (float(_values(block, key, 1, where)[0]) for key in ("cx", "cy", "fx", "fy"))
-    dist = _values(block, "dist", 5, where)
+    stated = _bare(block, "distortion_model") if "distortion_model" in block else "plumb_bob"
+    if stated not in _MODELS:
+        raise CalibrationError(
+            f"{where}: distortion_model is {stated!r}; MRPT's are {', '.join(_MODELS)}"
+        )
+    model, counts = _MODELS[stated]
+    count = len(_bare(block, "dist").split()) if "dist" in block else counts[0]
+    dist = _values(block, "dist", count if count in counts else counts[0], where).tolist()
     with naming(where):
         K = intrinsic_matrix(fx, fy, cx, cy)
-        return camera_from_matrix(K, *size, "radtan", trimmed_coefficients(dist.tolist()))
+        bent = trimmed_coefficients(dist) if model == "radtan" else tuple(dist)
+        return camera_from_matrix(K, *size, model, bent)
+
+
+def _bare(block: Mapping[str, object], key: str) -> str:
+    """Return an entry without the brackets of a list and the comment behind it."""
+    return str(block[key]).split("//")[0].replace(",", " ").strip("[] \t")
 
 
 def _values(block: Mapping[str, object], key: str, count: int, where: str) -> FloatArray:
     """Return the numbers of an entry, `[1 2 3]` or one, without the comment behind them."""
     if key not in block:
         raise CalibrationError(f"{where}: has no entry {key}; copy the calibration again")
-    bare = str(block[key]).split("//")[0].replace(",", " ")
-    return numbers_in(bare.strip("[] \t"), count, f"{where}, {key}")
+    return numbers_in(_bare(block, key), count, f"{where}, {key}")
