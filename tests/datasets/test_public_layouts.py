@@ -15,6 +15,7 @@ import vio
 from tests.plain_maker import STEP_S, make_plain
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
+from vio.datasets.plain import pair_layout
 from vio.datasets.sides import stamped_sides
 from vio.errors import CalibrationError, DataError
 
@@ -235,3 +236,18 @@ def test_a_rendered_drive_has_its_views_beside_depths_and_its_truth(tmp_path: Pa
     last = len(poses) - 2
     (tmp_path / "extrinsic.txt").write_text("\n".join(poses[:last]) + "\n")
     assert len(open_dataset(tmp_path).recording.reference or ()) == 2
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        ("normal/left", "normal/right"),  # of an exposure
+        ("depth/infra_left", "depth/infra_right"),  # of a depth camera's module
+        ("seg_1/left", "seg_1/right"),  # of a recording
+    ],
+)
+def test_views_are_not_left_out_by_their_names(tmp_path: Path, others: tuple[str, str]) -> None:
+    """Of two pairs, neither is taken without a word."""
+    for folders in (others, ("dark/left", "dark/right")):
+        make_plain(tmp_path, 1, folders=folders, calibration=False, imu=False, reference=False)
+    assert pair_layout(tmp_path) is None
