@@ -17,6 +17,7 @@ import vio
 from tests.plain_maker import STEP_S, make_plain
 from vio.datasets import open_dataset
 from vio.datasets.image_pairs import ImageDataset
+from vio.datasets.plain import pair_layout
 from vio.datasets.sides import first_pair, pairs_of, stamped_sides
 from vio.errors import CalibrationError, DataError
 from vio.records import StereoFrame
@@ -293,3 +294,18 @@ def test_a_folder_with_kittis_names_may_have_a_calibration_by_hand(tmp_path: Pat
     (tmp_path / "calib.txt").write_text("fx: 60\ncx: 32\ncy: 24\n")
     with pytest.raises(CalibrationError, match=r"lines begin with 'P\d:'"):
         open_dataset(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        ("normal/left", "normal/right"),  # of an exposure
+        ("depth/infra_left", "depth/infra_right"),  # of a depth camera's module
+        ("seg_1/left", "seg_1/right"),  # of a recording
+    ],
+)
+def test_views_are_not_left_out_by_their_names(tmp_path: Path, others: tuple[str, str]) -> None:
+    """Of two pairs, neither is taken without a word."""
+    for folders in (others, ("dark/left", "dark/right")):
+        make_plain(tmp_path, 1, folders=folders, calibration=False, imu=False, reference=False)
+    assert pair_layout(tmp_path) is None

@@ -103,8 +103,9 @@ _INSIDE = ("data", "images", "")
 # words of folders of images that show no view, beside those that do (Virtual KITTI, TartanAir, Isaac)
 _OTHER_THAN_VIEWS = frozenset((
     "depth", "depths", "disparity", "disparities", "disp", "flow", "instance", "label", "labels",
-    "mask", "masks", "normal", "normals", "seg", "segmentation", "semantic", "semantics",
+    "mask", "masks", "normals", "segmentation", "semantic", "semantics",
 ))  # fmt: skip
+_OF_VIEWS = frozenset(("infra", "infrared", "ir"))  # also in the folder of a depth camera
 
 
 class _FolderRules(NamedTuple):
@@ -154,7 +155,7 @@ def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
     if known is not None:
         return known
     names = [str(folder) for folder in image_folders(path)]
-    views = [name for name in names if not _OTHER_THAN_VIEWS.intersection(words_of(name))]
+    views = [name for name in names if _may_show_views(name)]
     pair = first_pair(pairs_of(views)) or first_pair(pairs_of(names))
     if pair is None:
         return None
@@ -162,6 +163,12 @@ def pair_layout(path: Path, folders: str | None = None) -> Layout | None:
     # as where an archive was unpacked: what belongs to the images lies beside them
     base = left.parent if left.parent == right.parent else path
     return Layout(path, base, left, right)
+
+
+def _may_show_views(name: str) -> bool:
+    """Return whether a folder of images is not, by its name, one of depths, segments or masks."""
+    words = set(words_of(name))
+    return bool(words & _OF_VIEWS) or not words & _OTHER_THAN_VIEWS
 
 
 def side_by_side(path: Path, calibration: Path | None = None) -> Layout | None:
