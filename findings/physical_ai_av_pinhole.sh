@@ -3,7 +3,7 @@
 # principal point by the cosine of the angle too: 30 degrees from the axis of a camera of 1920 x 1080 the pixel is 218 px off, at 45 degrees 595 px. `pixel2ray` raises for the pixels (..., 2) of its own text.
 # `FThetaCameraModel.ray2pixel` is right, but for a ray along the optical axis, and `pixel2ray` for the principal point, return NaN.
 # Guessed: a pinhole camera of a vendor's kit projects as a pinhole camera, and a fisheye camera has an axis.
-# Matters here: images of that data set that were rectified, and its lidar points as truth for depths, are projected with this class, which `CameraIntrinsics.from_intrinsics_df` takes as an argument; near the
+# Matters here: who rectifies images of that data set, or projects its lidar points as truth for depths, gives this class to `CameraIntrinsics.from_intrinsics_df`, which takes the f-theta one unless told otherwise; near the
 # middle of the image errors are small (1.1 px at 2.5 degrees), and lidar points on the road ahead look right.
 # Source: physical_ai_av/utils/camera_models.py; OpenCV's projectPoints for comparison; this run. Its module is loaded by its path, as the packages for downloads are not needed for it.
 set -euo pipefail
