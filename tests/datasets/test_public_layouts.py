@@ -309,3 +309,12 @@ def test_views_are_not_left_out_by_their_names(tmp_path: Path, others: tuple[str
     for folders in (others, ("dark/left", "dark/right")):
         make_plain(tmp_path, 1, folders=folders, calibration=False, imu=False, reference=False)
     assert pair_layout(tmp_path) is None
+
+
+@pytest.mark.parametrize("held", [b"\xff\xfe\x00", b"", b"1 0 0 0\n0 1 0 0\n0 0 1 0\n"])
+def test_an_extrinsic_txt_of_another_kind_is_not_used(tmp_path: Path, held: bytes) -> None:
+    make_plain(tmp_path, 2, reference=False)
+    (tmp_path / "extrinsic.txt").write_bytes(held)
+    recording = open_dataset(tmp_path).recording
+    assert recording.reference is None
+    assert "not used: extrinsic.txt" in recording.notes

@@ -17,7 +17,7 @@ from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import naming, numbers_in
 from vio.datasets.rigs.plausible import checked_rig
 from vio.datasets.rigs.source import Size, no_image_size
-from vio.errors import CalibrationError
+from vio.errors import CalibrationError, DataError
 from vio.files.text import text_lines
 from vio.geometry.lie import FloatArray, checked_transform, se3_inverse
 from vio.geometry.stereo import intrinsic_matrix
@@ -79,8 +79,11 @@ def poses_of_left(folder: Path) -> Trajectory | None:
 
 
 def _begins(path: Path, header: list[str]) -> bool:
-    """Return whether the first line of a text file begins with these words."""
-    first = next((line.split() for _, line in text_lines(path)), [])
+    """Return whether a file is a text whose first line begins with these words."""
+    try:
+        first = next((line.split() for _, line in text_lines(path)), [])
+    except DataError:  # no text: another program's
+        return False
     return first[: len(header)] == header
 
 
