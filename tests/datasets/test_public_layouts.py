@@ -217,7 +217,8 @@ def test_a_principal_point_of_exchanged_numbers_is_refused(
 
 
 def test_a_rendered_drive_has_its_views_beside_depths_and_its_truth(tmp_path: Path) -> None:
-    """As Virtual KITTI 2: frames/rgb/Camera_0 beside frames/depth/Camera_0, 4 by 4 to the cameras."""
+    """As Virtual KITTI 2: frames/rgb/Camera_0 beside frames/depth/Camera_0, 4 by 4 to the cameras.
+    """
     folders = ("frames/rgb/Camera_0", "frames/rgb/Camera_1")
     make_plain(tmp_path, 3, folders=folders, calibration=False, imu=False, reference=False)
     for kind in ("depth", "classSegmentation"):
@@ -255,8 +256,8 @@ def test_numbered_parts_of_one_camera_are_no_pair(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("image", "inside"), [("frame", "results"), ("left", "")])
 def test_depth_images_may_lie_beside_the_images(image: str, inside: str, tmp_path: Path) -> None:
-    """As Replica's results/frame000000.jpg and depth000000.png with cam_params.json above, and a ZED's
-    export of left images and depths.
+    """As Replica's results/frame000000.jpg and depth000000.png with cam_params.json above, and a
+    ZED's export of left images and depths.
     """
     scene = tmp_path / "room0"
     folder = scene / inside

@@ -1,5 +1,5 @@
-"""Estimates of the stereo calibration that move further than they may, and what positions may be off
-by then.
+"""Estimates of the stereo calibration that move further than they may, and what positions may be
+off by then.
 """
 
 from __future__ import annotations
@@ -94,7 +94,8 @@ def test_terms_that_move_and_leave_lengths_as_they_are_enlarge_what_is_stated() 
 
 
 def test_terms_that_move_enlarge_what_is_stated_now() -> None:
-    """Healthy fisheye lenses at streets came to eleven times the sigma by what was stated before."""
+    """Healthy fisheye lenses at streets came to eleven times the sigma by what was stated before.
+    """
     tilt = np.zeros(FIELD_TERMS)
     tilt[1] = 40 * KNOWN_SIGMA
     before, now = 4 * KNOWN_SIGMA, KNOWN_SIGMA

@@ -104,11 +104,11 @@ def is_driving_stereo(path: Path) -> bool:
 
 
 def read_driving_stereo(path: Path) -> tuple[CameraModel, CameraModel, FloatArray]:
-    """Return DrivingStereo's rectified cameras and `T_rect1_rect0` (4, 4), whose published images are
-    rectified.
+    """Return DrivingStereo's rectified cameras and `T_rect1_rect0` (4, 4), whose published images
+    are rectified.
 
-    The baseline is that of the raw cameras, `R_101 T_101 R_103 T_103`, as the last column of `P_rect_103`
-    is that of whole images in the files of half ones too.
+    The baseline is that of the raw cameras, `R_101 T_101 R_103 T_103`, as the last column of
+    `P_rect_103` is that of whole images in the files of half ones too.
     Reference: Yang et al., DrivingStereo (2019), and public reports of its half-size calibrations.
 
     Raises:

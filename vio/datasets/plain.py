@@ -100,7 +100,8 @@ ALONE = (
 _GRAY = (0, 1)  # of KITTI
 _COLOUR = (2, 3)
 _INSIDE = ("data", "images", "")
-# words of folders of images that show no view, beside those that do (Virtual KITTI, TartanAir, Isaac)
+# words of folders of images that show no view, beside those that do (Virtual KITTI, TartanAir,
+# Isaac)
 _OTHER_THAN_VIEWS = frozenset((
     "depth", "depths", "disparity", "disparities", "disp", "flow", "instance", "label", "labels",
     "mask", "masks", "normals", "segmentation", "semantic", "semantics",
@@ -221,7 +222,8 @@ def _pair_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
 
 
 def _depths_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
-    """Return where images and their depth images lie in one folder, and both; None: there are none."""
+    """Return where images and their depth images lie in one folder, and both; None: there are none.
+    """
     layout = _one_folder(path)
     if layout is None:
         return None
@@ -234,8 +236,8 @@ def _depths_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
 
 
 def _one_folder(path: Path) -> Layout | None:
-    """Return the layout of the folder in which all images of a recording lie; None: there is none, or
-    there are several.
+    """Return the layout of the folder in which all images of a recording lie; None: there is none,
+    or there are several.
     """
     layout = _layout_of_one(path)
     if layout is None and _holds_images(path):

@@ -153,8 +153,8 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
 
 
 def _check_side_by_side(rig: Rig, video: _Facts, path: Path, calibration: Path) -> None:
-    """Raise DataError where a calibration is not of half the width of a single video, by the size that
-    it states, or by a principal point in the middle of the whole width.
+    """Raise DataError where a calibration is not of half the width of a single video, by the size
+    that it states, or by a principal point in the middle of the whole width.
     """
     if (rig.cam0.width, rig.cam0.height) != (video.width // 2, video.height):
         # no frame in the middle: all before it would be decoded

@@ -4,8 +4,8 @@ Errors of a calibration are constants to the filter, but for a slow walk. An est
 changes by no more than its standard deviation was before: the change from one frame to a later one
 has the covariance that the estimate has lost between them. One that moves further shows that
 something else is in the pixels: a mount that gives, a lens that slides or breathes, another
-rectification, or errors of pixels that images share and the filter does not know of. Whatever it is,
-disparities were off by as much meanwhile, and so was the length of the motion.
+rectification, or errors of pixels that images share and the filter does not know of. Whatever it
+is, disparities were off by as much meanwhile, and so was the length of the motion.
 
 With the change `x` (8,) of the coefficients of (R3) in docs/math.md, `P` their covariance before,
 and `D` (N, 8) what they do to the disparities `d` (N,) of the features seen, lengths are off by the
@@ -15,8 +15,8 @@ the change as a whole, `x' P^-1 x`, is beyond its quantile: other terms that mov
 covariance is too small.
 
 Before motion has told much of the calibration, an estimate that moves is one whose prior was off,
-which is another matter: then nothing is concluded. Nor is it across a new start of the filter, which
-gives up what was known.
+which is another matter: then nothing is concluded. Nor is it across a new start of the filter,
+which gives up what was known.
 Reference for the change of an estimate: Hausman, Specification tests in econometrics, Econometrica
 (1978).
 """
@@ -103,7 +103,8 @@ class CalibrationDrift:
         self._known.clear()
 
     def _scale_by_field(self, seen: Observations) -> FloatArray | None:
-        """The share (8,) of lengths by one unit of each coefficient; None: too few features tell."""
+        """The share (8,) of lengths by one unit of each coefficient; None: too few features tell.
+        """
         z = seen.z[seen.has_right]
         z = z[z[:, 0] - z[:, 2] > _DRIFT.min_disparity_px]
         if len(z) < _DRIFT.min_features:

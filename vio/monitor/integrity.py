@@ -38,8 +38,8 @@ _HOLDS_NS = NS_PER_S  # an event without an end is one of the second after it
 # findings on the state that was estimated, not on a sensor
 OF_THE_STATE = ("estimate-implausible", "estimate-restarted", "estimate-lost", "scale-off")
 _MIN_SPEED_MPS = 0.1  # of a rig that stands still as far as the estimate says
-# Levels of what the scale may be off by, over it: from one to the next. Where one is reached, earlier
-# frames below it are brought to it.
+# Levels of what the scale may be off by, over it: from one to the next. Where one is reached,
+# earlier frames below it are brought to it.
 _SCALE_DOUBT_GROWS = 1.5
 _MAX_DRIFT_FRAMES = 40  # for which a calibration has moved before that is seen
 
@@ -146,8 +146,8 @@ class IntegrityMonitor:
         self._largest = 0.0
         # of the logarithm of a scale that nothing measures, and of what the position is off by for it
         self._unscaled = np.zeros((4, 4))
-        # steps of the last frames, and the level of the doubt of their lengths by a calibration that
-        # moves
+        # steps of the last frames, and the level of the doubt of their lengths by a calibration
+        # that moves
         self._steps_m = deque[float](maxlen=_MAX_DRIFT_FRAMES)
         self._step_levels = deque[int](maxlen=_MAX_DRIFT_FRAMES)
         self._drift: tuple[int, int] = 0, 0  # level and number of frames that the next one shows

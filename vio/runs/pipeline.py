@@ -200,8 +200,8 @@ def run(
         VioError: the configuration, the data or the estimation is at fault; the message says which.
             With a folder, a fault after the first frame ends the run in order instead, and the
             result names it.
-        TypeError: a path is given in the place of the recording, a dictionary for the settings, or a
-            name for a part, a map or a folder.
+        TypeError: a path is given in the place of the recording, a dictionary for the settings, or
+            a name for a part, a map or a folder.
     """
     refuse_other_types(config, dataset=dataset)
     _check_arguments(parts, map, control)

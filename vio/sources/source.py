@@ -152,8 +152,9 @@ def open_source(name: str, layout: Layout = "side-by-side") -> LiveSource:
 class ImuInterpolation:
     """Holds samples of the gyro until the accelerometer has samples around them.
 
-    The accelerometer's readings are interpolated linearly; samples of the gyro before its first one,
-    and in a gap of it, are left out, as where both are joined in a file (`vio.imu.two_sensors`).
+    The accelerometer's readings are interpolated linearly; samples of the gyro before its first
+    one, and in a gap of it, are left out, as where both are joined in a file
+    (`vio.imu.two_sensors`).
     """
 
     def __init__(self) -> None:

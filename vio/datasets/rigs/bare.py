@@ -1,9 +1,10 @@
 """The intrinsics of one camera as bare numbers in a text file, as folders of RGB-D images have them.
 
-`fx fy cx cy` in a line, with `k1 k2 p1 p2 [k3]` behind (ETH3D's `calibration.txt` has the four), or a
-matrix of 3 x 3 or 4 x 4 numbers (`intrinsics.txt`, ScanNet's `intrinsic_color.txt`). Pixels; neither
-the size of the images nor the unit of depths is stated. Of a rectified pair, the nine numbers of the matrix
-in a line, and the baseline in metres in the next (FoundationStereo's `K.txt`).
+`fx fy cx cy` in a line, with `k1 k2 p1 p2 [k3]` behind (ETH3D's `calibration.txt` has the four), or
+a matrix of 3 x 3 or 4 x 4 numbers (`intrinsics.txt`, ScanNet's `intrinsic_color.txt`). Pixels;
+neither the size of the images nor the unit of depths is stated. Of a rectified pair, the nine
+numbers of the matrix in a line, and the baseline in metres in the next (FoundationStereo's
+`K.txt`).
 Reference: ETH3D's SLAM documentation ("fx fy cx cy"); Schops et al., BAD SLAM (2019).
 """
 
@@ -76,8 +77,8 @@ def read_bare(path: Path, size: Size | None) -> Rig:
 
 
 def _of_pair(path: Path) -> tuple[FloatArray, float] | None:
-    """Return a matrix (3, 3), in one row or three, with the baseline of a pair in the row below; None:
-    the file holds something else.
+    """Return a matrix (3, 3), in one row or three, with the baseline of a pair in the row below;
+    None: the file holds something else.
     """
     rows = _rows_of_numbers(path)
     if rows is None or [len(row) for row in rows] not in ([9, 1], [3, 3, 3, 1]):

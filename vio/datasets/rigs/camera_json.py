@@ -1,8 +1,9 @@
 """One camera as JSON: Open3D's intrinsics and the Replica recordings' `cam_params.json`.
 
-Open3D: `width`, `height` and `intrinsic_matrix`, the nine numbers column by column, in a block `intrinsic`
-where the pose is beside it. Replica, as rendered for NICE-SLAM: a block `camera` with `w h fx fy cx cy` in
-pixels and `scale`, the levels of a depth image per metre. Neither has a distortion.
+Open3D: `width`, `height` and `intrinsic_matrix`, the nine numbers column by column, in a block
+`intrinsic` where the pose is beside it. Replica, as rendered for NICE-SLAM: a block `camera` with
+`w h fx fy cx cy` in pixels and `scale`, the levels of a depth image per metre. Neither has a
+distortion.
 Reference: Open3D's PinholeCameraIntrinsic; Zhu et al., NICE-SLAM (2022), its data.
 """
 

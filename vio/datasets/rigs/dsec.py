@@ -1,10 +1,11 @@
 """DSEC's `cam_to_cam.yaml`: two cameras of images between two event cameras, as rectified.
 
-`intrinsics` has `cam1` (left) and `cam2` (right) of images, and `camRect1`, `camRect2` of the rectified
-ones, which are those published: `camera_matrix` fx fy cx cy in pixels, `resolution` width and height.
-`extrinsics`: `T_21` (4, 4) maps coordinates of cam1 to cam2, metres, and `R_rect1`, `R_rect2` (3, 3) those
-of a camera to its rectified one.
-Reference: Gehrig et al., DSEC: a stereo event camera dataset for driving scenarios (2021), data format.
+`intrinsics` has `cam1` (left) and `cam2` (right) of images, and `camRect1`, `camRect2` of the
+rectified ones, which are those published: `camera_matrix` fx fy cx cy in pixels, `resolution` width
+and height. `extrinsics`: `T_21` (4, 4) maps coordinates of cam1 to cam2, metres, and `R_rect1`,
+`R_rect2` (3, 3) those of a camera to its rectified one.
+Reference: Gehrig et al., DSEC: a stereo event camera dataset for driving scenarios (2021), data
+format.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""MRPT's calibration of a pair, an INI file, as kinect-stereo-calib writes it and the Malaga sets have it.
+"""MRPT's calibration of a pair, an INI file, as kinect-stereo-calib writes it and the Malaga sets
+have it.
 
 `[CAMERA_PARAMS_LEFT]` and `[CAMERA_PARAMS_RIGHT]`: `resolution`, `cx cy fx fy` in pixels, `dist` of
-OpenCV's model, k1 k2 p1 p2 k3. MRPT 2 states a `distortion_model` as well: `plumb_bob`, with or without
-k4 k5 k6, `kannala_brandt`, OpenCV's fisheye, k1 to k4, or `none`. `[CAMERA_PARAMS_LEFT2RIGHT_POSE]`:
-`pose_quaternion`, the pose of the right camera in the left one, x y z in metres and a quaternion w x y z.
-The part before `LEFT` may differ.
+OpenCV's model, k1 k2 p1 p2 k3. MRPT 2 states a `distortion_model` as well: `plumb_bob`, with or
+without k4 k5 k6, `kannala_brandt`, OpenCV's fisheye, k1 to k4, or `none`.
+`[CAMERA_PARAMS_LEFT2RIGHT_POSE]`: `pose_quaternion`, the pose of the right camera in the left one,
+x y z in metres and a quaternion w x y z. The part before `LEFT` may differ.
 Reference: MRPT's TStereoCamera and TCamera; Blanco et al., The Malaga Urban Dataset (2014).
 """
 

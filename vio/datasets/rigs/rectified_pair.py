@@ -1,9 +1,10 @@
 """The numbers of a rectified pair by their names: `fx fy cx cy` in pixels and `baseline`.
 
-YAML, JSON or lines `fx: 700` or `fx = 700`; names in small or capital letters, in one block or in several, as
-Cityscapes' `intrinsic: {fx fy u0 v0}` and `extrinsic: {baseline}`. Without `fy`, it is `fx`. `cx1` is that
-of the right camera. The baseline is in metres, or in the unit that ends its name (`baseline_mm`). The size
-may be stated as `width height`. Distortions are refused: raw images have no baseline alone.
+YAML, JSON or lines `fx: 700` or `fx = 700`; names in small or capital letters, in one block or in
+several, as Cityscapes' `intrinsic: {fx fy u0 v0}` and `extrinsic: {baseline}`. Without `fy`, it is
+`fx`. `cx1` is that of the right camera. The baseline is in metres, or in the unit that ends its
+name (`baseline_mm`). The size may be stated as `width height`. Distortions are refused: raw images
+have no baseline alone.
 Reference: the description of Cityscapes' camera files; `stereodemo_calibration.json` of stereodemo.
 """
 
@@ -61,8 +62,8 @@ def read(source: Source) -> Rig:
     """Read the pair.
 
     Raises:
-        CalibrationError: a number is impossible, a distortion is stated, or no size of the images is
-            stated or given.
+        CalibrationError: a number is impossible, a distortion is stated, or no size of the images
+            is stated or given.
     """
     where = source.where
     named = _named(source.entries)

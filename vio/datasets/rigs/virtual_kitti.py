@@ -1,9 +1,10 @@
-"""Virtual KITTI 2: `intrinsic.txt` and `extrinsic.txt` of a rendered pair, `Camera_0` and `Camera_1`.
+"""Virtual KITTI 2: `intrinsic.txt` and `extrinsic.txt` of a rendered pair, `Camera_0` and
+`Camera_1`.
 
 Below a header, a line for each frame and camera: its numbers, then `K[0,0] K[1,1] K[0,2] K[1,2]` in
-pixels, or a matrix (4, 4) that maps world coordinates to the camera, metres. All frames have one rig; the
-first one is read. Neither file states the size of the images. The matrices of camera 0 are the ground
-truth.
+pixels, or a matrix (4, 4) that maps world coordinates to the camera, metres. All frames have one
+rig; the first one is read. Neither file states the size of the images. The matrices of camera 0 are
+the ground truth.
 Reference: Cabon et al., Virtual KITTI 2 (2020), and the description of its files.
 """
 
@@ -58,8 +59,8 @@ def read_virtual_kitti(path: Path, size: Size | None) -> Rig:
 
 
 def poses_of_left(folder: Path) -> Trajectory | None:
-    """Return the poses of the left camera that a recording's `extrinsic.txt` states, frame by frame;
-    None: there is none, or frames are missing in it.
+    """Return the poses of the left camera that a recording's `extrinsic.txt` states, frame by
+    frame; None: there is none, or frames are missing in it.
 
     Raises:
         CalibrationError: a line is malformed.
