@@ -250,16 +250,7 @@ class IntegrityMonitor:
         if integrity == "nominal" and doubt_m == 0.0:
             return estimate
         codes = tuple(sorted(f.code for f in held if f.effect != "nominal"))
-        covariance = estimate.covariance
-        if doubt_m > 0.0:
-            covariance = inflated(covariance, doubt_m)
-        return replace(
-            estimate,
-            integrity=integrity,
-            findings=codes,
-            covariance=covariance,
-            position_doubt_m=doubt_m,
-        )
+        return _with_doubt(estimate, integrity, codes, doubt_m)
 
     def _measure_doubt(self, now_ns: int, step_ns: int, held: list[Finding]) -> None:
         """Bring what the position may be off by to the present, a step after the last frame."""
@@ -389,11 +380,21 @@ def marked(estimate: Estimate, mark: Mark, sigma_m: float) -> Estimate:
     codes = estimate.findings
     if mark.code is not None:
         codes = tuple(sorted({*codes, mark.code}))
+    more_m = sigma_m if mark.share > 0.0 or mark.scale > 0.0 else 0.0
+    return _with_doubt(estimate, integrity, codes, more_m)
+
+
+def _with_doubt(
+    estimate: Estimate, integrity: Integrity, codes: tuple[str, ...], more_m: float
+) -> Estimate:
+    """Return an estimate as findings judge it; its position may be off by `more_m` beside what was
+    in doubt.
+    """
     covariance = estimate.covariance
     doubt_m = estimate.position_doubt_m
-    if mark.share > 0.0 or mark.scale > 0.0:
-        covariance = inflated(covariance, sigma_m)
-        doubt_m = float(np.hypot(doubt_m, sigma_m))
+    if more_m > 0.0:
+        covariance = inflated(covariance, more_m)
+        doubt_m = float(np.hypot(doubt_m, more_m))
     return replace(
         estimate,
         integrity=integrity,
