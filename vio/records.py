@@ -289,25 +289,27 @@ def _meet(ids: IntArray, other: IntArray, rows: IntArray, others: IntArray) -> i
     if float(last) - float(first) >= _ID_SPAN * (len(ids) + len(other)):  # whole ones overflow
         return -1
     span = last - first + 1
-    row = np.empty(span, np.int64)
-    for k in range(span):
-        row[k] = -1
-    for k in range(len(ids)):
-        if first <= ids[k] <= last:
-            row[ids[k] - first] = k
-    place = np.empty(span, np.int64)
-    for k in range(span):
-        place[k] = -1
-    for k in range(len(other)):
-        if first <= other[k] <= last:
-            place[other[k] - first] = k
+    places = np.empty((2, span), np.int64)
+    _look_up(ids, first, places[0])
+    _look_up(other, first, places[1])
     count = 0
     for k in range(span):
-        if row[k] >= 0 and place[k] >= 0:
-            rows[count] = row[k]
-            others[count] = place[k]
+        if places[0, k] >= 0 and places[1, k] >= 0:
+            rows[count] = places[0, k]
+            others[count] = places[1, k]
             count += 1
     return count
+
+
+@compiled
+def _look_up(ids: IntArray, first: int, place: IntArray) -> None:
+    """Write where ids (N,) have each of the numbers (S,) from the first one on; -1: nowhere."""
+    last = first + len(place) - 1
+    for k in range(len(place)):
+        place[k] = -1
+    for k in range(len(ids)):
+        if first <= ids[k] <= last:
+            place[ids[k] - first] = k
 
 
 def observations(
