@@ -15,6 +15,7 @@ from vio.errors import DataError
 from vio.findings import Finding
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.arrays import distinct_rows
 from vio.records import (
     BoolArray,
     FrontendOutput,
@@ -164,12 +165,9 @@ def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
     ids = prior.ids
     z = prior.z
     if (ids[1:] <= ids[:-1]).any():
-        order = ids.argsort(kind="stable")
-        ids = ids[order]
-        is_first = np.ones(len(ids), dtype=np.bool_)
-        is_first[1:] = ids[1:] != ids[:-1]
-        ids = ids[is_first]
-        z = z[order[is_first]]
+        first = distinct_rows(ids)
+        ids = ids[first]
+        z = z[first]
     finite = np.isfinite(z[:, :2]).all(axis=1)
     R = prior.R_cam_prev
     if R is not None and not _is_rotation(R):
