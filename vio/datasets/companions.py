@@ -424,13 +424,16 @@ def _read_reference(
     layout = images.layout
     bases = (layout.root, layout.base, layout.root / "dso")
     file = next((f for n in _REFERENCES for base in bases if (f := base / n).is_file()), None)
-    if file is None and images.calibration[0].name == REPLICA:
-        file = next((f for f in (layout.root / "traj.txt",) if f.is_file()), None)
-    truth = poses_of_left(layout.root) if file is None else read_trajectory(file)
-    if truth is None:
-        return None, None
+    of_replica = layout.root / "traj.txt"
+    if file is None and images.calibration[0].name == REPLICA and of_replica.is_file():
+        file = of_replica
     if file is None:
         file = layout.root / EXTRINSICS_OF_VIRTUAL_KITTI
+        truth = poses_of_left(layout.root)
+    else:
+        truth = read_trajectory(file)
+    if truth is None:
+        return None, None
     if truth.times_ns is None:
         truth = reference_of_images(truth, images.times[0], images.numbers, file)
     if is_pair_of_eth3d(layout):

@@ -204,10 +204,10 @@ def _pair_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
         DataError: each image has a time or number of its own, and those of the cameras fit none of
             each other's.
     """
-    layout = _one_folder(path)
-    if layout is None:
+    found = _in_one_folder(path)
+    if found is None:
         return None
-    files = list_images(layout.left)
+    layout, files = found
     sides = split_sides(files.names)
     if sides is None:
         sides = stamped_sides(files.names)
@@ -222,12 +222,11 @@ def _pair_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
 
 
 def _depths_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
-    """Return where images and their depth images lie in one folder, and both; None: there are none.
-    """
-    layout = _one_folder(path)
-    if layout is None:
+    """Return where images and their depth images lie in one folder, and both; None: there are none."""
+    found = _in_one_folder(path)
+    if found is None:
         return None
-    files = list_images(layout.left)
+    layout, files = found
     parts = split_depths(files.names)
     if parts is None:
         return None
@@ -235,14 +234,16 @@ def _depths_in_one_folder(path: Path) -> tuple[Layout, _Images] | None:
     return layout, _Images(FilePairs(images, images), depths=depths)
 
 
-def _one_folder(path: Path) -> Layout | None:
-    """Return the layout of the folder in which all images of a recording lie; None: there is none,
-    or there are several.
+def _in_one_folder(path: Path) -> tuple[Layout, ImageFiles] | None:
+    """Return the layout of the folder in which all images of a recording lie, and the images; None:
+    there is none, or there are several.
     """
     layout = _layout_of_one(path)
     if layout is None and _holds_images(path):
         layout = Layout(path, path, path, path)
-    return _only_folder(path) if layout is None else layout
+    if layout is None:
+        layout = _only_folder(path)
+    return None if layout is None else (layout, list_images(layout.left))
 
 
 def _only_folder(path: Path) -> Layout | None:
