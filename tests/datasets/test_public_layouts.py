@@ -217,8 +217,7 @@ def test_a_principal_point_of_exchanged_numbers_is_refused(
 
 
 def test_a_rendered_drive_has_its_views_beside_depths_and_its_truth(tmp_path: Path) -> None:
-    """As Virtual KITTI 2: frames/rgb/Camera_0 beside frames/depth/Camera_0, 4 by 4 to the cameras.
-    """
+    """As Virtual KITTI 2: frames/rgb/Camera_0 beside frames/depth/Camera_0, 4 by 4 to the cameras."""
     folders = ("frames/rgb/Camera_0", "frames/rgb/Camera_1")
     make_plain(tmp_path, 3, folders=folders, calibration=False, imu=False, reference=False)
     for kind in ("depth", "classSegmentation"):

@@ -94,8 +94,7 @@ def test_terms_that_move_and_leave_lengths_as_they_are_enlarge_what_is_stated() 
 
 
 def test_terms_that_move_enlarge_what_is_stated_now() -> None:
-    """Healthy fisheye lenses at streets came to eleven times the sigma by what was stated before.
-    """
+    """Healthy fisheye lenses at streets came to eleven times the sigma by what was stated before."""
     tilt = np.zeros(FIELD_TERMS)
     tilt[1] = 40 * KNOWN_SIGMA
     before, now = 4 * KNOWN_SIGMA, KNOWN_SIGMA

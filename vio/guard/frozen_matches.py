@@ -8,6 +8,7 @@ import numpy as np
 
 from vio.findings import begun, ended
 from vio.guard.match_check import Hysteresis, MatchCheck, SharedMatches, without_right
+from vio.numerics.robust import median
 from vio.records import Observations
 
 
@@ -53,8 +54,8 @@ def _is_frozen(shared: SharedMatches) -> bool | None:
     if len(shared) < _FROZEN.min_matches:
         return None
     moved = np.abs(shared.now - shared.before)
-    left = float(np.median(moved[:, :2].max(axis=1)))
-    right = float(np.median(moved[:, 2:].max(axis=1)))
+    left = median(moved[:, :2].max(axis=1))
+    right = median(moved[:, 2:].max(axis=1))
     if left < _FROZEN.min_motion_px:
         return None
     if right <= _FROZEN.frozen_share * left:

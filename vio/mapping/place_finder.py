@@ -396,9 +396,8 @@ class PlaceFinder:
         )
         there = graph.drift(i, np.full(len(i), m), systematic=systematic)
         T = graph.T_map_cam
-        B = se3_adjoint(
-            se3_inverse(T[k]) @ T[np.maximum(i, m)]
-        )  # `drift` is in the frame of the later
+        # `drift` is in the frame of the later keyframe
+        B = se3_adjoint(se3_inverse(T[k]) @ T[np.maximum(i, m)])
         by_loop = B @ there @ np.swapaxes(B, 1, 2) + here
         shorter = np.trace(by_loop[:, :3, :3], axis1=1, axis2=2) < np.trace(
             direct[:, :3, :3], axis1=1, axis2=2

@@ -103,8 +103,7 @@ class CalibrationDrift:
         self._known.clear()
 
     def _scale_by_field(self, seen: Observations) -> FloatArray | None:
-        """The share (8,) of lengths by one unit of each coefficient; None: too few features tell.
-        """
+        """The share (8,) of lengths by one unit of each coefficient; None: too few features tell."""
         z = seen.z[seen.has_right]
         z = z[z[:, 0] - z[:, 2] > _DRIFT.min_disparity_px]
         if len(z) < _DRIFT.min_features:

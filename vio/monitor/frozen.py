@@ -564,8 +564,7 @@ def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:
 
 @compiled
 def _write_flow(before: Image, after: Image, pixels: FloatArray, flow: FloatArray) -> int:
-    """Write the flow (M, 2) of patches around pixels (N, 2) that are inside; return their number.
-    """
+    """Write the flow (M, 2) of patches around pixels (N, 2) that are inside; return their number."""
     size = (2 * _RADIUS + 1) ** 2
     margin = _RADIUS + 1
     height, width = before.shape
